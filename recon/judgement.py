@@ -101,28 +101,25 @@ def judge(
     figures = {} if truth is None else by_truth(truth.data, volume.data)
     along_rows, unseen, structure, stray, seconds = None, None, None, None, 0.0
     odd, skipped, fitted = tuple[OddView, ...](), list[str](), Look.FIT in looks
-    geometry = views.geometry
     if Look.RESIDUAL in looks:
         begun = time.now()
         left, along_rows = volume_left(volume, views, _VIEWS, progress, beside_uniform=fitted)
-        figures["residual"], compared = left.residual, left.rays.sum()
+        figures["residual"], projected = left.residual, left.rays.sum() * (3 if fitted else 1)
         if held_out is not None:
             unseen, _ = volume_left(volume, held_out, held_out.geometry.n_views, progress)
-            figures["residual_held_out"], compared = unseen.residual, compared + unseen.rays.sum()
-        seconds = (time.now() - begun) * views.data.size / float(compared)
+            figures["residual_held_out"], projected = unseen.residual, projected + unseen.rays.sum()
+        seconds = (time.now() - begun) * views.data.size / float(projected)
     if fitted and (structure := unexplained(volume, views, np.random.default_rng(seed))) is not None:
         figures["unexplained"] = structure.share
 
     def has_time(work: float, name: str) -> bool:
         """Whether there is time for as much work as that of projecting all views so often."""
-        if enough := work == 0 or time.leaves(work * seconds):
-            return enough
-        skipped.append(name)
-        return False
+        enough = work == 0 or time.leaves(work * seconds)
+        skipped.extend([] if enough else [name])
+        return enough
 
-    if Look.STRAY in looks and has_time(
-        stray_mass_share(geometry, volume.grid), "the look for mass where views show nothing"
-    ):
+    work = stray_mass_share(views.geometry, volume.grid)
+    if Look.STRAY in looks and has_time(work, "the look for mass where views show nothing"):
         stray = stray_mass(volume, views)
         figures |= {} if stray is None else {"stray": stray.share}
     if fitted and has_time(_ODD_VIEWS_WORK, "the look for views that do not fit the volume"):

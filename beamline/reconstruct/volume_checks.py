@@ -77,10 +77,11 @@ def check_volume(
     tell(_sample_radius(made, prepared))
     looks, fitted = _looks(made, prepared, context), not by_name(made.method).traits.direct
     time = TimeLeft(clock.now, lambda seconds: not made.ending.early and context.leaves(seconds))
-    views, held_out, progress = prepared.views, prepared.views_held_out, context.phases.progress
+    progress = context.phases.progress
     judgement = judge(
-        made.volume, views, truth, held_out=held_out, looks=looks, seed=context.seed, time=time, progress=progress
-    )
+        made.volume, prepared.views, truth,
+        held_out=prepared.views_held_out, looks=looks, seed=context.seed, time=time, progress=progress,
+    )  # fmt: skip
     metrics: dict[str, dict[str, float]] = {made.method: {**judgement.figures, "seconds": made.seconds}}
     hiding = _structure(made, judgement)
     tell(not_begun_warning(made, judgement), hiding, _stray_mass(made, judgement) if fitted else "")
@@ -91,7 +92,9 @@ def check_volume(
             before = clock.now()
             fbp = _fbp(made, prepared, target, context)
             seconds, residual = clock.now() - before, looks & Look.RESIDUAL
-            of_fbp = judge(fbp, views, truth, held_out=held_out, looks=residual, progress=progress).figures
+            of_fbp = judge(
+                fbp, prepared.views, truth, held_out=prepared.views_held_out, looks=residual, progress=progress
+            ).figures
             volumes = {BASELINE: fbp, **volumes}
             metrics = {BASELINE: {**of_fbp, "seconds": seconds}, **metrics}
         else:

@@ -73,11 +73,11 @@ def test_bands_of_rows_stand_for_a_large_detector(monkeypatch: pytest.MonkeyPatc
 def test_looks_for_which_there_is_no_time_are_named() -> None:
     ball, clock = _ball(), iter(range(9))
     views = _views(ball)
-    hurried = TimeLeft(lambda: float(next(clock)), lambda seconds: seconds < 0.5)
+    hurried = TimeLeft(lambda: float(next(clock)), lambda seconds: seconds < 0.1)
     found = judge(ball, views, looks=Look.RESIDUAL | Look.STRAY | Look.FIT, time=hurried)
     assert found.skipped == (
         "the look for mass where views show nothing",
         "the look for views that do not fit the volume",
     )
-    assert found.stray is None and found.seconds_of_views == pytest.approx(20 / 16)
+    assert found.stray is None and found.seconds_of_views == pytest.approx(20 / 16 / 3)
     assert judge(ball, views, looks=Look.STRAY).skipped == ()
