@@ -24,8 +24,7 @@ from recon.base.method import (
     RunControl,
     Traits,
 )
-from recon.base.views import Views
-from recon.base.volume import Grid, Volume
+from recon.base.volume import Grid
 from recon.splatting.finish import FIRST_SHARE, beyond_voxels, level_of
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.r2 import R2
@@ -38,10 +37,11 @@ from recon.voxels.held_out import (
     TRIAL_ROWS,
     cheapest_not_led,
     split_views,
+    unseen_residuals,
 )
 from recon.voxels.iterative import prior_decisions
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.residuals import residuals_of
+from recon.voxels.projector import Projector, projection_lines
 
 LEFT = "root mean square left of views held out, in line integrals"
 """What a trial states: on some rows, with rays weighed. The data residual of a volume is a share of the views."""
@@ -179,13 +179,16 @@ def of_views(problem: ReconProblem, views: NDArray[np.intp]) -> ReconProblem:
 
 
 def _residuals(made: Reconstruction, method: Method, problem: ReconProblem) -> F64:
-    """`residuals_of` a result, negative values at zero; of a fit less the level of what is beyond them."""
-    grid, views = made.volume.grid, problem.projections
+    """`unseen_residuals` of a result, negative values at zero; of a fit less the level of what is beyond them."""
+    grid = made.volume.grid
+    projector, views = Projector(problem.geometry, grid), problem.projections
     if made.gaussians is not None and isinstance(method, FitMethod):
         beyond = beyond_voxels(made.gaussians, problem.geometry, grid, method.fit)
         views = views if beyond is None else views - level_of(beyond)
-    volume = Volume(np.maximum(made.volume.data, 0), grid)
-    return residuals_of(volume, Views(views, problem.geometry, problem.use.weights))
+    model, weights = projector.forward(np.maximum(made.volume.data, 0)), problem.use.weights
+    model, views = (projection_lines(each) for each in (model, views))
+    rays = None if weights is None else projection_lines(weights)
+    return unseen_residuals(model, views, rays, projector.resolution)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from recon.assess import metrics
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Clock
-from recon.base.views import Views
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.matter_checks import (
     StrayMass,

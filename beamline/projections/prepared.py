@@ -16,7 +16,7 @@ from recon.base.arrays import F32, I64
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.method import SampleRadius
-from recon.base.views import Views
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections

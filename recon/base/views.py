@@ -1,17 +1,12 @@
-"""Views with their geometry and weights; selections of them by a short form such as fixed:90 or sector:30-150:60."""
+"""Selections of views: by a short form such as all, fixed:90, sector:30-150:60 or every:4, and evenly spread ones."""
 
 from __future__ import annotations
 
 import operator
 import re
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-from recon.base.arrays import F32
-from recon.base.geometry import Geometry
-from recon.base.masks import RayWeights
 
 FORMS = "all, fixed:N, sector:A-B[:N] (degrees), random:N[:seed], first:N, every:K"
 
@@ -19,24 +14,6 @@ _NUMBER = r"[+-]?\d+(?:\.\d*)?"
 _SECTOR = re.compile(rf"({_NUMBER})-({_NUMBER})(?::(\d+))?")
 _RANDOM = re.compile(r"(\d+)(?::(\d+))?")
 _COUNT = re.compile(r"\d+")
-
-
-class Views(NamedTuple):
-    """Line integrals with their geometry and weights.
-
-    Attributes:
-        data: [view, row, col]. Values that are not finite were not measured.
-        weights: of the rays [view, row, col]; those of weight 0 were not measured. None: one for all.
-    """
-
-    data: F32
-    geometry: Geometry
-    weights: F32 | RayWeights | None = None
-
-    def rows(self, rows: slice) -> Views:
-        """The same views of some detector rows."""
-        weights = None if self.weights is None else self.weights[:, rows]
-        return Views(self.data[:, rows], self.geometry.rows(rows.start, rows.stop), weights)
 
 
 def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = np.pi) -> NDArray[np.int64]:

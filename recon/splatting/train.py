@@ -19,7 +19,7 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked, usual_weight
 from recon.base.method import DataUse, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.ray_width import NO_WIDTH
-from recon.base.views import Views, used_and_kept_back
+from recon.base.views import used_and_kept_back
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
@@ -43,10 +43,10 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
-from recon.voxels.held_out import LEAST_GAIN, cheapest_not_led
+from recon.voxels.held_out import LEAST_GAIN, cheapest_not_led, unseen_residuals
 from recon.voxels.iterative import UNITS
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.residuals import residuals_of
+from recon.voxels.projector import Projector, projection_lines
 
 _ON_VOXELS = FistaTv, PnpDct  # candidates that a fit is compared with, the simpler one first
 _DECIDED = "candidate", UNITS, "weight", "strength"  # decisions that a checkpoint keeps
@@ -374,7 +374,11 @@ def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
 
 def _predicts_worse(finished: Volume, fitted: Volume, unseen: F32, views: Geometry) -> bool:
     """Whether the finished volume leaves more of the views held out than the fit's, by more than 0.1 dB."""
-    after, before = (np.square(residuals_of(volume, Views(unseen, views))) for volume in (finished, fitted))
+    projector, lines = Projector(views, fitted.grid), projection_lines(unseen)
+    after, before = (
+        np.square(unseen_residuals(projection_lines(projector.forward(volume.data)), lines, None, projector.resolution))
+        for volume in (finished, fitted)
+    )
     return bool(after.mean() > 10 ** (0.1 / 10) * before.mean())
 
 

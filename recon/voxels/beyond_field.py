@@ -20,7 +20,7 @@ from recon.base.empirical import LIGHT_WEIGHT
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights, masked
 from recon.base.method import SAMPLE, DataUse, Method, ReconProblem, Reconstruction, RunControl, SampleRadius, Traits
-from recon.base.views import Views, spread_views
+from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.field_edges import (
     busiest_rows,
@@ -30,10 +30,9 @@ from recon.voxels.field_edges import (
     taller_than_field,
     wider_than_field,
 )
-from recon.voxels.held_out import LEAST_VIEWS, beyond_chance, split_views
+from recon.voxels.held_out import LEAST_VIEWS, beyond_chance, split_views, unseen_residuals
 from recon.voxels.methods import FistaTv
-from recon.voxels.projector import Projector
-from recon.voxels.residuals import residuals_of
+from recon.voxels.projector import Projector, projection_lines
 
 _COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16  # of a trial: columns and rows after binning, views, iterations
 _LOOKS = 8  # views by which rows are chosen
@@ -241,8 +240,11 @@ class _Trial:
 
     def of_radius(self, radius: float) -> tuple[F64, float]:
         """Residual [view held out] of a box that reaches so far, and the mean density in the middle of the field."""
-        data, geometry = self.seen
+        (data, geometry), (judged, apart) = self.seen, self.unseen
         grid = self.box.reaching(radius, geometry)
         method = FistaTv(iterations=_SWEEPS, tv_weight=LIGHT_WEIGHT)
         volume = method.run(ReconProblem(data, geometry, grid, DataUse(), 0, "cpu"), RunControl()).volume
-        return residuals_of(volume, Views(*self.unseen)), _middle_density(volume, geometry.reach)
+        projector = Projector(apart, grid)
+        model = projection_lines(projector.forward(volume.data))
+        residuals = unseen_residuals(model, projection_lines(judged), None, projector.resolution)
+        return residuals, _middle_density(volume, geometry.reach)

@@ -26,7 +26,7 @@ from recon.base.volume import Grid
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, subsets_of
 from recon.voxels.projector import Projector
-from recon.voxels.residuals import unseen_residuals
+from recon.voxels.residuals import unseen_residuals as unseen_residuals
 from recon.voxels.voxel_problem import VoxelProblem
 
 TRIAL_SWEEPS = 20

@@ -15,7 +15,8 @@ from recon.base.geometry import Geometry
 from recon.base.masks import masked
 from recon.base.noise import air_level, noise_level, ring_offsets
 from recon.base.slabs import part_of
-from recon.base.views import Views, spread
+from recon.base.view_data import Views
+from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
 from recon.voxels.projector import Projector, seen_rays
@@ -112,7 +113,7 @@ def seen_empty(views: Views, grid: Grid) -> tuple[Mask, Mask]:
     A ray meets none where its line integral, blurred by a pixel, is within four standard deviations of the noise, or
     within 0.5 % of the thick parts. So matter much thinner than that counts as none.
     """
-    projections, geometry, weights = views
+    projections, geometry, weights = views.data, views.geometry, views.weights
     some = spread(np.arange(geometry.n_views), _VIEWS)
     data, known = masked(projections[some], None if weights is None else weights[some])
     noise = noise_level(data) / (2 * math.sqrt(math.pi) * _BLUR)  # after the blur

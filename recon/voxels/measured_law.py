@@ -24,16 +24,14 @@ from recon.base.arrays import F32, bin_views
 from recon.base.decisions import Decisions
 from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
-from recon.base.views import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.beyond_field import offset_error, sample_radius
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
-from recon.voxels.held_out import preferred_strength, split_views
+from recon.voxels.held_out import preferred_strength, split_views, unseen_residuals
 from recon.voxels.iterative import IterativeMethod, solve
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector, projection_lines
-from recon.voxels.residuals import residuals_of
 from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -195,10 +193,11 @@ class _Slab:
         self.volume(_WeightByNoise(), self.views, tried)
         first = float(self.decisions["weight"][0] / math.sqrt(len(tried)))
         seen, unseen = (tried[part] for part in split_views(self.geometry.select(tried)))
-        held_out = Views(self.views[unseen], self.geometry.select(unseen))
+        projector, held_out = Projector(self.geometry.select(unseen), self.box), projection_lines(self.views[unseen])
 
         def residuals(weight: float) -> NDArray[np.float64]:
-            return residuals_of(Volume(self.volume(_TotalVariation(weight), self.views, seen), self.box), held_out)
+            model = projector.forward(self.volume(_TotalVariation(weight), self.views, seen))
+            return unseen_residuals(projection_lines(model), held_out, None, projector.resolution)
 
         best = preferred_strength(residuals, first) if first > 0 else None
         return first if best is None else best.strength

@@ -13,7 +13,7 @@ from recon.base.arrays import F32, bin_views
 from recon.base.geometry import Geometry
 from recon.base.noise import deviation_between_neighbours
 from recon.base.slabs import part_of
-from recon.base.views import Views
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, project, projection_images, volume_lines
 
@@ -138,7 +138,7 @@ def _differences(volume: Volume, whole: Views, side: int, progress: Callable[[in
 
     [view, cell, cell] each, averaged over cells, in standard deviations of noise.
     """
-    projections, geometry, weights = whole
+    projections, geometry, weights = whole.data, whole.geometry, whole.weights
     rows, cols = (n // side for n in geometry.detector_shape)
     # Means over cells: the difference in light, its part explained by edges, the known pixels, the view in light, the
     # light, and the difference.

@@ -10,7 +10,8 @@ import numpy as np
 
 from recon.base.arrays import F32, F64, I64, Mask
 from recon.base.slabs import part_of
-from recon.base.views import Views, spread
+from recon.base.view_data import Views
+from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, projection_lines, volume_lines
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution

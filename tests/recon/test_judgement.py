@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
-from recon.base.views import Views
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.judgement import Look, TimeLeft, contrast, judge
 from recon.voxels import residuals

@@ -12,7 +12,7 @@ from recon import methods
 from recon.auto import Auto, part_of
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, ReconProblem
-from recon.base.views import Views
+from recon.base.view_data import Views
 from recon.voxels.odd_views import odd_views
 from recon.voxels.projector import Projector, seen_rays
 from tests.recon.helpers import data_residual

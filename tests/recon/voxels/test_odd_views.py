@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from recon.base.geometry import Geometry
-from recon.base.views import Views
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.odd_views import LIMIT, odd_views
 from recon.voxels.projector import Projector

@@ -9,7 +9,7 @@ import pytest
 
 import recon
 from recon.base.geometry import Geometry
-from recon.base.views import Views
+from recon.base.view_data import Views
 from recon.voxels.matter_checks import STRAY_LIMIT, seen_empty, stray_mass
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
-from recon.base.views import Views
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, unexplained
 from recon.voxels.projector import Projector
