@@ -33,7 +33,7 @@ _ODD_VIEWS_WORK = 1.5  # projections of all rays
 _REGIONS, _REGION = 2**21, 12  # voxels at most of regions (`metrics.sampled`); bytes of a voxel
 
 
-class Look(Flag):
+class Aspect(Flag):
     """What a volume is judged by, beside a truth.
 
     RESIDUAL: what it leaves of up to 16 views used, and of all views held out. STRAY: mass where views show nothing.
@@ -83,7 +83,7 @@ def judge(
     truth: Volume | None = None,
     *,
     held_out: Views | None = None,
-    looks: Look = Look.RESIDUAL,
+    aspects: Aspect = Aspect.RESIDUAL,
     seed: int = 0,
     time: TimeLeft = TimeLeft(),  # noqa: B008 - a constant
     progress: Callable[[int, int], None] = lambda done, of: None,
@@ -100,8 +100,8 @@ def judge(
     """
     figures = {} if truth is None else by_truth(truth.data, volume.data)
     along_rows, unseen, structure, stray, seconds = None, None, None, None, 0.0
-    odd, skipped, fitted = tuple[OddView, ...](), list[str](), Look.FIT in looks
-    if Look.RESIDUAL in looks:
+    odd, skipped, fitted = tuple[OddView, ...](), list[str](), Aspect.FIT in aspects
+    if Aspect.RESIDUAL in aspects:
         begun = time.now()
         left, along_rows = volume_left(volume, views, _VIEWS, progress, beside_uniform=fitted)
         figures["residual"], projected = left.residual, left.rays.sum() * (3 if fitted else 1)
@@ -119,7 +119,7 @@ def judge(
         return enough
 
     work = stray_mass_share(views.geometry, volume.grid)
-    if Look.STRAY in looks and has_time(work, "the look for mass where views show nothing"):
+    if Aspect.STRAY in aspects and has_time(work, "the look for mass where views show nothing"):
         stray = stray_mass(volume, views)
         figures |= {} if stray is None else {"stray": stray.share}
     if fitted and has_time(_ODD_VIEWS_WORK, "the look for views that do not fit the volume"):
@@ -130,8 +130,8 @@ def judge(
 def judge_memory(geometry: Geometry, *, fitted: bool) -> int:
     """Approximate memory of `judge` and `contrast` in bytes, without projections and volume."""
     grid = Grid.matching(geometry)
-    looks = unexplained_memory(geometry), stray_mass_memory(geometry, grid), fitted * odd_views_memory(geometry)
-    return max(_REGION * min(math.prod(grid.shape), _REGIONS), *looks)
+    most = max(unexplained_memory(geometry), stray_mass_memory(geometry, grid), fitted * odd_views_memory(geometry))
+    return max(most, _REGION * min(math.prod(grid.shape), _REGIONS))
 
 
 def by_truth(truth: F32, volume: F32) -> dict[str, float]:

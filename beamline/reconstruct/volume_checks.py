@@ -17,7 +17,7 @@ from beamline.storage.disk_file import scratch_array
 from drivers.base.clock import Clock
 from recon.base.method import SAMPLE, Reconstruction, SampleRadius
 from recon.base.volume import Grid, Volume
-from recon.judgement import Judgement, Look, TimeLeft, contrast, judge
+from recon.judgement import Aspect, Judgement, TimeLeft, contrast, judge
 from recon.methods import BASELINE, by_name
 from recon.splatting.gaussians import NEEDLES_LIMIT, needles
 from recon.voxels.direct import direct, has_direct_method
@@ -75,12 +75,12 @@ def check_volume(
         figures = {"residual": made.series.residual, "seconds": made.seconds}
         return CheckedVolume(Judgement(figures), volumes, {made.method: figures}, warnings)
     tell(_sample_radius(made, prepared))
-    looks, fitted = _looks(made, prepared, context), not by_name(made.method).traits.direct
+    aspects, fitted = _aspects(made, prepared, context), not by_name(made.method).traits.direct
     time = TimeLeft(clock.now, lambda seconds: not made.ending.early and context.leaves(seconds))
     progress = context.phases.progress
     judgement = judge(
         made.volume, prepared.views, truth,
-        held_out=prepared.views_held_out, looks=looks, seed=context.seed, time=time, progress=progress,
+        held_out=prepared.views_held_out, aspects=aspects, seed=context.seed, time=time, progress=progress,
     )  # fmt: skip
     metrics: dict[str, dict[str, float]] = {made.method: {**judgement.figures, "seconds": made.seconds}}
     hiding = _structure(made, judgement)
@@ -91,9 +91,9 @@ def check_volume(
         if time.leaves(_FBP_WORK * judgement.seconds_of_views):
             before = clock.now()
             fbp = _fbp(made, prepared, target, context)
-            seconds, residual = clock.now() - before, looks & Look.RESIDUAL
+            seconds, residual = clock.now() - before, aspects & Aspect.RESIDUAL
             of_fbp = judge(
-                fbp, prepared.views, truth, held_out=prepared.views_held_out, looks=residual, progress=progress
+                fbp, prepared.views, truth, held_out=prepared.views_held_out, aspects=residual, progress=progress
             ).figures
             volumes = {BASELINE: fbp, **volumes}
             metrics = {BASELINE: {**of_fbp, "seconds": seconds}, **metrics}
@@ -110,8 +110,8 @@ def check_volume(
     return CheckedVolume(judgement, volumes, metrics, warnings, hiding, text if skipped else "")
 
 
-def _looks(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> Look:
-    """What can be looked at: without residuals where views show more than the volume.
+def _aspects(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> Aspect:
+    """What the volume can be judged by: without residuals where views show more than the volume.
 
     That is, more than a region, or than a field that does not hold all of the sample, where what lies beside it was not
     taken off. A direct volume leaves the blur of its filter in the views.
@@ -124,8 +124,8 @@ def _looks(made: Reconstruction, prepared: PreparedProjections, context: ReportC
     else:
         show_more = bool(FieldEdges.of(prepared.projections.data, geometry).beyond())
     if show_more:
-        return Look.STRAY
-    return Look.STRAY | Look.RESIDUAL | (Look.FIT if fitted else Look(0))
+        return Aspect.STRAY
+    return Aspect.STRAY | Aspect.RESIDUAL | (Aspect.FIT if fitted else Aspect(0))
 
 
 def _sample_radius(made: Reconstruction, prepared: PreparedProjections) -> str:

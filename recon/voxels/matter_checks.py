@@ -40,14 +40,13 @@ class StrayMass:
     """Mass of a volume in the voxels that views show to be empty.
 
     Attributes:
-        empty: share of the voxels that are shown to be empty.
-        share: of the volume's mass that lies in them, counting densities above a twentieth of the density unit.
+        share: of the volume's mass that lies in the voxels that are shown to be empty, counting densities above a
+            twentieth of the density unit.
         map: float32 [y, x], the highest density above each other in these voxels.
         first: number of the first slice that was looked at.
         air: bool [slice, y, x], those of these voxels that every view looked at sees: beyond, FBP means nothing.
     """
 
-    empty: float
     share: float
     map: F32
     first: int
@@ -82,7 +81,7 @@ def stray_mass(volume: Volume, views: Views) -> StrayMass | None:
         return None
     stray = np.where(empty & (matter > _FAINT * np.percentile(positive, _MATTER)), matter, 0)
     share = float(stray.sum(dtype=np.float64) / matter.sum(dtype=np.float64))
-    return StrayMass(float(empty.mean()), share, stray.max(axis=0), first, empty & by_all)
+    return StrayMass(share, stray.max(axis=0), first, empty & by_all)
 
 
 def stray_mass_memory(geometry: Geometry, grid: Grid) -> int:

@@ -95,11 +95,13 @@ def volume_left(
         differences.
     """
     some, grid = spread(np.arange(views.geometry.n_views), most), volume.grid
-    volumes = [volume, *(_uniform(grid) if beside_uniform else ())]
+    _, y, x = grid.coordinates()
+    inside = np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2
+    uniform = [Volume(np.broadcast_to(np.float32(at), grid.shape), grid) for at in (inside, True)]
+    volumes = [volume, *uniform] if beside_uniform else [volume]
     bands = _bands(views, some, grid)
     # What is not looked at in bands of rows takes less memory in groups of views.
-    whole = beside_uniform and not views.geometry.rows_show_slices
-    groups = np.array_split(np.arange(some.size), min(some.size, _GROUPS) if whole else 1)
+    groups = np.array_split(np.arange(some.size), 1 if views.geometry.rows_show_slices else min(some.size, _GROUPS))
     sums, products, total = np.zeros((3, some.size)), np.zeros((4, 4)), 0.0
     for n, (group, rows) in enumerate(((group, rows) for group in groups for rows in bands), 1):
         geometry, part, slices = views.geometry.select(some[group]), grid, slice(None)
@@ -120,13 +122,6 @@ def volume_left(
             total += float(np.square(_without_means(lines, counts)).sum())
         progress(n * some.size // (len(bands) * len(groups)), some.size)
     return SquaresLeft(*sums), _along_rows(products, total) if beside_uniform else None
-
-
-def _uniform(grid: Grid) -> list[Volume]:
-    """A cylinder and a box of one density that fill the slices."""
-    _, y, x = grid.coordinates()
-    inside = np.hypot(y[:, None], x) < grid.spacing[1] * min(grid.shape[1:]) / 2
-    return [Volume(np.broadcast_to(np.float32(at), grid.shape), grid) for at in (inside, True)]
 
 
 def _along_rows(products: F64, total: float) -> tuple[float, float]:

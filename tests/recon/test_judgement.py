@@ -8,7 +8,7 @@ import pytest
 from recon.base.geometry import Geometry
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
-from recon.judgement import Look, TimeLeft, contrast, judge
+from recon.judgement import Aspect, TimeLeft, contrast, judge
 from recon.voxels import residuals
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
@@ -74,10 +74,10 @@ def test_looks_for_which_there_is_no_time_are_named() -> None:
     ball, clock = _ball(), iter(range(9))
     views = _views(ball)
     hurried = TimeLeft(lambda: float(next(clock)), lambda seconds: seconds < 0.1)
-    found = judge(ball, views, looks=Look.RESIDUAL | Look.STRAY | Look.FIT, time=hurried)
+    found = judge(ball, views, aspects=Aspect.RESIDUAL | Aspect.STRAY | Aspect.FIT, time=hurried)
     assert found.skipped == (
         "the look for mass where views show nothing",
         "the look for views that do not fit the volume",
     )
     assert found.stray is None and found.seconds_of_views == pytest.approx(20 / 16 / 3)
-    assert judge(ball, views, looks=Look.STRAY).skipped == ()
+    assert judge(ball, views, aspects=Aspect.STRAY).skipped == ()

@@ -17,7 +17,7 @@ from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.method import Ending, Reconstruction
 from recon.base.volume import Grid, Volume
-from recon.judgement import Look, judge
+from recon.judgement import Aspect, judge
 from recon.splatting.gaussians import Gaussians
 from recon.voxels.projector import project
 from tests.beamline.prepared_views import prepared_views
@@ -113,7 +113,7 @@ def test_a_volume_of_one_density_is_said_to_show_nothing(
         prepared = replace(prepared, projections=replace(prepared.projections, data=data))
     blank = np.float32(0.7 * truth.mean())
     volume = replace(made.volume, data=amount * truth + (1 - amount) * blank)
-    judgement = judge(volume, prepared.views, looks=Look.RESIDUAL | Look.FIT)
+    judgement = judge(volume, prepared.views, aspects=Aspect.RESIDUAL | Aspect.FIT)
     assert (judgement.figures["residual"] > 0.5) is (wider or not begun)
     said = not_begun_warning(replace(made, volume=volume), judgement)
     assert (said == "") is begun
@@ -135,7 +135,7 @@ def test_the_differences_that_a_uniform_cylinder_leaves_in_closed_form() -> None
     left = {}
     for name, data in {"one": shadow, "two": factors * shadow, "within others": factors * (shadow + 30)}.items():
         views = replace(prepared, projections=replace(prepared.projections, data=data))
-        found = judge(full, views.views, looks=Look.RESIDUAL | Look.FIT).along_rows
+        found = judge(full, views.views, aspects=Aspect.RESIDUAL | Aspect.FIT).along_rows
         assert found is not None
         left[name] = found
     assert left["one"][1] <= left["one"][0] < left["one"][1] + 0.001 and left["one"][0] < 0.02
