@@ -58,12 +58,12 @@ def licence(package: Distribution) -> str:
     said = package.metadata
     if key(said["Name"]) in READ:
         return READ[key(said["Name"])]
-    if said.get("License-Expression"):
+    if said["License-Expression"]:
         return str(said["License-Expression"])
     classes = [line.split(" :: ")[-1] for line in said.get_all("Classifier") or () if line.startswith("License :: ")]
     if named := [_CLASSES.get(name, name) for name in classes if name != "OSI Approved"]:
         return " AND ".join(named)
-    text = str(said.get("License") or "").strip()
+    text = str(said["License"] or "").strip()
     return text if len(text) < 60 and "\n" not in text else ""
 
 

@@ -34,7 +34,7 @@ def test_every_write_is_counted_and_can_be_the_last(tmp_path: Path) -> None:
             path.unlink()
         return found
 
-    command = [sys.executable, "-c", CODE, tmp_path]
+    command = [sys.executable, "-c", CODE, str(tmp_path)]
     assert faulty_disk.writes(command, str(tmp_path)) == 6
     assert sizes() == {"b": 32}
     left = [{"a": 0}, {"a": 100}, {"a": 100}, {"a": 50, "b": 0}, {"a": 50, "b": 32}, {"c": 50, "b": 32}]

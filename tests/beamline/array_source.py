@@ -46,7 +46,7 @@ class ArraySource:
     not_used: tuple[Any, ...] = ()
     attributes: dict[str, Any] = {}  # noqa: RUF012
     row_period: float | None = None
-    flags = None
+    flags: Any = None
     currents: NDArray[np.float64] | None = None
     unpack_bytes: int = 0
     energies: NDArray[np.float64] | None = None

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from beamline.config import load as config
+from beamline.config.load import camera_settings
 from beamline.config.models import Config
 from beamline.instrument import connect as devices
 from beamline.plan.plan import Block
@@ -45,7 +46,7 @@ def with_scene(settings: Config, scene: dict[str, Any]) -> Config:
 def fly(instrument: devices.ConnectedDevices, block: Block, settings: Config) -> tuple[list[int], np.ndarray]:
     """The block's passes by hand, as acquisition does it: framestamps and counts [frame, row, col]."""
     stage, camera = instrument.devices.stage, instrument.devices.camera
-    camera.configure(devices.camera_settings(settings, block.exposure, TriggerSource.EXTERNAL))
+    camera.configure(camera_settings(settings, block.exposure, TriggerSource.EXTERNAL))
     stamps, images = [], []
     camera.arm(block.n)
     for flown in passes(block):

@@ -18,6 +18,7 @@ from drivers.base.protocols import (
     CameraSettings,
     CameraTiming,
     Devices,
+    DigitalOutput,
     StageLimits,
     TriggerSource,
     TriggerTrain,
@@ -182,6 +183,9 @@ class Stage:
             self.move = move
             low, high = sorted((move.start, move.target))
             self.pulses = [(move.time_at(p), p) for _, p in self.pulses if low <= p <= high]
+
+    def digital_output(self, number: int) -> DigitalOutput:
+        raise DeviceRefused(self.name, "it has no outputs")
 
     def describe(self) -> dict[str, str | int | float]:
         return {"model": "fake stage"}

@@ -138,7 +138,7 @@ def digests(case: str, folder: Path) -> dict[str, str]:
     with ExitStack() as spying, _one_thread():
         spying.enter_context(_spied("beamline.reconstruct.pipeline", found))
         method = [] if follow else ["-m", "fbp"]
-        _run("recon", str(path), *method, *options, "--no-report", "-o", str(folder / "out.h5"))
+        _run("recon", str(path), *map(str, (*method, *options)), "--no-report", "-o", str(folder / "out.h5"))
     if not follow:  # how far a fit comes in its time is another thing each time
         with h5py.File(folder / "out.h5") as file:
             file.visititems(lambda name, item: found.update(_of_dataset(name, item)))

@@ -308,7 +308,7 @@ def _cathode(cols: int, rows: int, over: float, geometry: Geometry, fringes: boo
     keys |= {**larger, "diameter": 2 * can_radius(cols, over) * PITCH}
     sample, edge = build_sample("phantom", keys, Beam(1e5)), 2  # rows beyond, whose light the fringes move
     detector = Detector.centred(((rows + 2 * edge) * SUB, cols * SUB), PITCH / SUB)
-    effect = PhaseFringes(DELTA_BETA, DISTANCE, ENERGY, method="transport")  # type: ignore[abstract]
+    effect = PhaseFringes(DELTA_BETA, DISTANCE, ENERGY, method="transport")
     shot = shots.shot(detector=Detector.centred((rows + 2 * edge, cols), PITCH))
     clean = np.empty((geometry.n_views, rows, cols), np.float32)
     for view, angle in zip(clean, geometry.angles, strict=True):

@@ -90,7 +90,7 @@ def smaller(case: Case, rows: int = 4) -> Case:
 
 def judged(case: Case, volume: F32) -> float:
     """dB of a volume [z, y, x] in 1/pixel."""
-    volume = np.maximum(volume, 0) / np.float32(case.geometry.sample_pitch)
+    volume = (np.maximum(volume, 0) / np.float32(case.geometry.sample_pitch)).astype(np.float32)
     if case.unseen is not None:
         views, geometry, counts = case.unseen
         left = (strip_integrals(volume, geometry) - views)[counts]

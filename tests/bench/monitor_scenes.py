@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -157,7 +157,7 @@ class Several:
 
     @property
     def domain(self) -> Domain:
-        return self.parts[0].domain  # type: ignore[no-any-return]
+        return self.parts[0].domain
 
     def apply(self, image: Image, shot: Shot) -> Image:
         for part in self.parts:
@@ -375,7 +375,7 @@ def with_anomalies(base: Scene, anomalies: Sequence[Any]) -> Scene:
             ),
             len(effects),
         )
-        effects[at:at] = added if domain == Domain.MOTION else [Several(tuple(added))]
+        effects[at:at] = added if domain == Domain.MOTION else [cast(AnyEffect, Several(tuple(added)))]
     return replace(base, chain=Chain(tuple(effects)))
 
 

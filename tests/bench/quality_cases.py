@@ -209,7 +209,7 @@ def _thorax(folder: Path) -> F32:
     kind = {4: np.int16, 16: np.float32}[int(np.frombuffer(raw, np.int16, 1, 70)[0])]
     start = int(np.frombuffer(raw, np.float32, 1, 108)[0])
     volume = np.frombuffer(raw, kind, int(np.prod(shape, dtype=int)), start).reshape(shape[::-1])
-    return (np.clip(volume.astype(np.float32), -1000, 1500) + 1000) / 2500
+    return ((np.clip(volume, -1000, 1500) + 1000) / 2500).astype(np.float32)
 
 
 def _unit(volume: F32, high: float) -> F32:

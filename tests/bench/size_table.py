@@ -14,6 +14,7 @@ import resource
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def sample_of(cols: int, rows: int) -> Phantom:
     rng, side = np.random.default_rng(0), float(cols)
     places = zip(0.4 * side * np.sqrt(rng.random(200)), rng.uniform(0, 2 * np.pi, 200), strict=True)
     grains = [
-        Ellipsoid(tuple(size), 2.0 / side, centre=(r * np.cos(t), r * np.sin(t), z))  # type: ignore[arg-type]
+        Ellipsoid(tuple(size), 2.0 / side, centre=(r * np.cos(t), r * np.sin(t), z))
         for (r, t), size, z in zip(
             places, rng.uniform(side / 200, side / 25, (200, 3)), rng.uniform(-rows / 2, rows / 2, 200), strict=True
         )
@@ -72,7 +73,7 @@ def quality(path: Path, sample: Phantom) -> float:
 
 
 def measure(
-    folder: Path, method: str, cols: int, rows: int = 64, views: int = 90, limit: int = 600, *more: str
+    folder: Path, method: str, cols: int, rows: int = 64, views: int = 90, limit: int = 600, *, more: Sequence[str] = ()
 ) -> None:
     small, path = folder / "warm.tif", folder / f"{cols}x{rows}x{views}.tif"
     for scan, size in ((small, (64, 16, 24)), (path, (cols, rows, views))):
@@ -105,4 +106,4 @@ def measure(
 if __name__ == "__main__":
     _, where, name, *rest = sys.argv
     Path(where).mkdir(exist_ok=True)
-    measure(Path(where), name, *map(int, rest[:4]), *rest[4:])
+    measure(Path(where), name, *map(int, rest[:4]), more=rest[4:])

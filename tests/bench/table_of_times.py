@@ -62,8 +62,11 @@ class Row:
 
 
 def rows() -> Iterator[Row]:
-    demo, large = ("demo", "--json", "-o"), ("grains_512x128x180.tif", "--quantity", "line-integrals")
-    large += ("--angles", "grains_512x128x180.txt", "--pixel-size-um", "10")
+    demo = "demo", "--json", "-o"
+    large = (
+        "grains_512x128x180.tif", "--quantity", "line-integrals",
+        "--angles", "grains_512x128x180.txt", "--pixel-size-um", "10",
+    )  # fmt: skip
     yield Row("pip install", (), install=True)
     yield Row("demo, the first command", (*demo, "demo"), ("word", "frame", "slices"), new=True)
     yield Row("demo, no kernel compiled or carried", (*demo, "demo"), ("word", "frame", "slices"), first_run=True)
@@ -122,12 +125,13 @@ def measured(row: Row, checkout: Path, folder: Path, level: Mapping[str, str]) -
     )
     found: dict[str, float] = {}
     assert process.stdout is not None
-    for line in process.stdout:
-        if line.strip():
-            found.setdefault("word", time.perf_counter() - begin)
-        if line.startswith("{"):
-            event = json.loads(line)
-            found.setdefault(event["event"], event["time"] - clock)
+    with process.stdout as lines:
+        for line in lines:
+            if line.strip():
+                found.setdefault("word", time.perf_counter() - begin)
+            if line.startswith("{"):
+                event = json.loads(line)
+                found.setdefault(event["event"], event["time"] - clock)
     failed, seconds, after = process.wait(), time.perf_counter() - begin, os.times()
     if bool(failed) != row.refused:
         raise RuntimeError(f"{row.name}: exit code {failed}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -72,7 +73,10 @@ def _as_placed(found: Geometry, truth: Geometry) -> Geometry:
     )
 
 
-def _seconds(work: Callable[[], object]) -> tuple[float, object]:
+T = TypeVar("T")
+
+
+def _seconds(work: Callable[[], T]) -> tuple[float, T]:
     begun = time.process_time()
     done = work()
     return time.process_time() - begun, done
@@ -88,7 +92,7 @@ def test_calibration(beam: str, body: str, case: str) -> None:
     start = _geometry(beam, (SHAPE[1] - 1) / 2, np.zeros((VIEWS, 2)), 0, 0)
     views = sample.views(truth, NOISE)
     took, learnt = _seconds(lambda: learn_geometry(views, start, CASES[case]))
-    found = learnt.change.applied(start)  # type: ignore[attr-defined]
+    found = learnt.change.applied(start)
     off, mean = knowable(found.shifts - truth.shifts, truth.angles)
     axis = abs(found.axis_col + mean - truth.axis_col)
     across, down = np.sqrt(np.mean(off**2, axis=0))

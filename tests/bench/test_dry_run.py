@@ -101,7 +101,7 @@ def test_a_run_takes_the_seconds_that_were_expected(scan: str, method: Method) -
         made = recon.reconstruct(data, geometry, method)
     taken = (now() - begin) / repeats
     made_by = str(made.settings.get("volume_by", made.method))
-    expected = found.choice + found.volumes.get(made_by, found.volumes.get(method.name, found.most))
+    expected = found.choice_seconds + found.volumes.get(made_by, found.volumes.get(method.name, found.most))
     SHARES.append(expected / taken)
     near = sum(abs(share - 1) <= _WITHIN for share in SHARES)
     print(
@@ -114,5 +114,7 @@ def test_a_run_takes_the_seconds_that_were_expected(scan: str, method: Method) -
 @pytest.mark.bench
 def test_most_runs_were_near() -> None:
     """Of the runs before, in one call."""
+    if not SHARES:
+        pytest.skip("none ran before in this call")
     near = sum(abs(share - 1) <= _WITHIN for share in SHARES)
     assert near >= _MOST * len(SHARES)

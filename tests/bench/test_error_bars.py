@@ -85,7 +85,7 @@ def test_voxels_of_the_truth_within_one_deviation(shared_data: Path, name: str, 
         decide = Decisions(0)
         run, made = timed(method.run, problem, RunControl(decide=decide))
         bars, found = timed(error_bars, method, problem, made.volume, decide.made, RunControl())
-        within = np.abs(made.volume.data - case.truth) <= found.deviation
+        within = np.abs(made.volume.data - case.truth) <= found.deviation  # type: ignore[union-attr]
         shares = {part: float(within[parts[part]].mean()) for part in ("flat", "weak", "edge", "air") if part in parts}
         said = "  ".join(f"{part} {share:4.0%}" for part, share in shares.items())
         print(
@@ -122,7 +122,8 @@ def test_volumes_of_balls_within_their_intervals(seed: int, views: int, photons:
     counts = photons * np.exp(-2 / clean.max() * clean).reshape(views, 40, 2, 96, 2).mean(axis=(2, 4))
     geometry = Geometry.parallel(angles, (40, 96), pixel_pitch=1.0)
     box, corner = (slice(0, 40), slice(14, 82), slice(14, 82)), np.array([0.5, 14.5, 14.5])
-    for label, method in {"fbp": recon.Fbp(), "fista-tv": recon.FistaTv(tv_weight=3e-3)}.items():
+    methods: dict[str, recon.Method] = {"fbp": recon.Fbp(), "fista-tv": recon.FistaTv(tv_weight=3e-3)}
+    for label, method in methods.items():
         errors: list[float] = []
         for repeat in range(4):
             noisy = np.random.default_rng(10 * seed + repeat).poisson(counts)

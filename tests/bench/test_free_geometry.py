@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -20,12 +21,13 @@ from recon.base.vectors import geometry_of_vectors, vectors_of
 from recon.base.volume import Grid, Volume
 from tests.recon.base.test_vectors import rays
 
-F32, F64 = NDArray[np.float32], NDArray[np.float64]
+F32: TypeAlias = NDArray[np.float32]
+F64: TypeAlias = NDArray[np.float64]
 VIEWS, PHOTONS, DENSITY = 90, 1e5, 0.02
 HALF = np.array([24.3, 22.4, 5.4])  # of the plate along (x, y, z); edges lie within voxels
 GRID = Grid((20, 64, 64))
 INSIDE = slice(6, 14), slice(13, 51), slice(11, 53)
-METHODS = {
+METHODS: dict[str, recon.Method] = {
     "fbp": recon.Fbp(),
     "fista-tv": recon.FistaTv(),
     "fista-tv, weight 0.003": recon.FistaTv(tv_weight=0.003),

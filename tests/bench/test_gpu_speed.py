@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def _model(n: int, extent: float, seed: int = 0) -> Gaussians:
     )
 
 
-def _raw(g: Gaussians, backend: Backend) -> list[torch.Tensor]:
+def _raw(g: Gaussians, backend: Backend[Any]) -> list[torch.Tensor]:
     arrays = g.arrays()
     return [backend.array(arrays[name]) for name in ("means", "log_scales", "quaternions", "raw_densities")]
 
@@ -78,4 +79,4 @@ def test_a_step_and_thirty_thousand(n: int, side: int) -> None:
         f"\n{torch.cuda.get_device_name()}; {n} Gaussians on {side}²: a step {middle:.3f} ms (quartiles {spread:.3f}), "
         f"1000 steps {queued:.2f} s, so 30 000 in {30 * queued:.0f} s; peak {memory:.0f} MiB"
     )
-    assert queued > 0
+    assert queued < 1.2 * middle  # s of a thousand steps, and ms of one: queued they take no longer than one by one

@@ -49,9 +49,8 @@ def _scan(runs: Path, per_s: float, pages: int) -> tuple[float, float]:
     ]  # fmt: skip
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as scan:
         assert scan.stderr is not None
-        host, token = next(
-            found.groups() for line in scan.stderr if (found := re.search(r"watch: http://(\S+)/\?token=(\S+)", line))
-        )
+        address = re.compile(r"watch:?\s+http://(\S+)/\?token=(\S+)")
+        host, token = next(found.groups() for line in scan.stderr if (found := address.search(line)))
         watching = [threading.Thread(target=_page, args=(host, token), daemon=True) for _ in range(pages)]
         for thread in watching:
             thread.start()

@@ -55,7 +55,7 @@ def of_sub_scans(views: recon.TimedViews, parts: int) -> F32:
     ]
     middles = np.array([views.times[at].mean() for at in cut])
     shares = np.stack([np.interp(TIMES, middles, row) for row in np.eye(parts)], 1)
-    return np.tensordot(shares, np.stack(volumes), 1)
+    return np.tensordot(shares, np.stack(volumes), 1).astype(np.float32)
 
 
 @pytest.mark.parametrize(("phantom", "knots", "motion"), [(FOAM, 3, True), (CELL, 4, False)])

@@ -16,6 +16,7 @@ import pkgutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -59,15 +60,15 @@ def _wild(folder: Path, share: float, value: float) -> Case:
 
 
 ROWS: dict[str, Callable[[Path], Case]] = {
-    **{name: lambda folder, name=name: _slab(folder, name) for name in ("shell", "teapot", "foam", "bone", "cement")},
+    **{name: partial(_slab, name=name) for name in ("shell", "teapot", "foam", "bone", "cement")},
     "walnut": lambda folder: rows_of(walnut_held_out(folder), range(12, 20)),
     "teapot, cone": lambda folder: quality_cases.cone(folder, "teapot", VIEWS, 64),
     "shell, cone": lambda folder: quality_cases.cone(folder, "shell", VIEWS, 64),
     "region": _region,
     "wild pixels": lambda folder: _wild(folder, 2e-4, 12.0),
     "one wild pixel": lambda folder: _wild(folder, 0.0, 1e6),
-    **{f"12 {name}": lambda folder, name=name: _slab(folder, name, 12) for name in ("shell", "foam", "bone", "cement")},
-    **{f"180 {name}": lambda folder, name=name: _slab(folder, name, 180) for name in ("bone", "cement")},
+    **{f"12 {name}": partial(_slab, name=name, views=12) for name in ("shell", "foam", "bone", "cement")},
+    **{f"180 {name}": partial(_slab, name=name, views=180) for name in ("bone", "cement")},
 }
 ALL = "shell", "teapot", "foam", "walnut", "bone", "cement", "teapot, cone", "region"
 PATCHES = "foam", "walnut", "bone", "cement"

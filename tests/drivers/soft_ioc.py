@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import pytest
 
+from drivers.base.clock import Clock
 from drivers.epics.channel import PvValue
 from simulators.devices.clock import VirtualClock
 from simulators.wires.epics.wire import CHOICES, MotorRecord
@@ -147,7 +148,7 @@ def serve_pva(served: Fields, clock: TickingClock, patch: pytest.MonkeyPatch) ->
         ioc.stop()
 
 
-def record_of(clock: TickingClock, line: Any, **build: Any) -> MotorRecord:
+def record_of(clock: Clock, line: Any, **build: Any) -> MotorRecord:
     """A record with these options of its build."""
     from simulators.wires.epics.wire import EpicsBuild
 

@@ -127,7 +127,9 @@ def _pv_filter(places: dict[str, float | str]) -> Callable[[Any], PvFilter]:
 
 
 def _pv_monochromator(unit: EnergyUnit) -> Callable[[Any], PvMonochromator]:
-    urls = {name: f"{URL}{end}" for name, end in (("pv", "wanted"), ("status_pv", "is"), ("stop_pv", "stop"))}
+    urls: dict[str, Any] = {
+        name: f"{URL}{end}" for name, end in (("pv", "wanted"), ("status_pv", "is"), ("stop_pv", "stop"))
+    }
     pvs = MonochromatorPvs(**urls, unit=unit, timeout=5.0, travel=4.0)
     return lambda clock: PvMonochromator(pvs, clock)
 
@@ -150,7 +152,7 @@ KINDS: dict[str, Callable[[ExitStack, pytest.MonkeyPatch], Rig]] = {
 }
 
 
-@pytest.fixture(params=KINDS.values(), ids=KINDS)
+@pytest.fixture(params=list(KINDS.values()), ids=list(KINDS))
 def rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rig]:
     with ExitStack() as opened:
         yield request.param(opened, monkeypatch)

@@ -44,8 +44,8 @@ class Bodies:
                 else:
                     start, rays = across, np.broadcast_to(beam, across.shape)
                 out[view] += self._integrals(start, rays) / len(_FINE)
-        out = out.reshape(geometry.n_views, rows, cols)
-        return (out + np.random.default_rng(seed).normal(0, noise * out.max(), out.shape)).astype(np.float32)
+        views = out.reshape(geometry.n_views, rows, cols)
+        return (views + np.random.default_rng(seed).normal(0, noise * views.max(), views.shape)).astype(np.float32)
 
     def _integrals(self, start: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
         total = np.zeros(len(rays))

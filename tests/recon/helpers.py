@@ -24,7 +24,7 @@ def in_double(gaussians: Gaussians) -> Gaussians:
         tensor.detach().double().requires_grad_()
         for tensor in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.raw_densities)
     ]
-    return Gaussians(*leaves, density_unit=gaussians.density_unit, kernel=gaussians.kernel)
+    return Gaussians(leaves[0], leaves[1], leaves[2], leaves[3], gaussians.density_unit, gaussians.kernel)
 
 
 def as_leaves(gaussians: Gaussians, device: torch.device | None = None) -> Gaussians:
@@ -33,7 +33,7 @@ def as_leaves(gaussians: Gaussians, device: torch.device | None = None) -> Gauss
         tensor.detach().to(device, copy=True).requires_grad_()
         for tensor in (gaussians.means, gaussians.log_scales, gaussians.quaternions, gaussians.raw_densities)
     ]
-    return Gaussians(*leaves, density_unit=gaussians.density_unit, kernel=gaussians.kernel)
+    return Gaussians(leaves[0], leaves[1], leaves[2], leaves[3], gaussians.density_unit, gaussians.kernel)
 
 
 def gradients(gaussians: Gaussians) -> dict[str, torch.Tensor]:

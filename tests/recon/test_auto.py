@@ -134,7 +134,7 @@ def test_a_gain_of_a_percent_is_not_worth_another_method_unless_the_best_is_aske
 
 
 def test_it_says_what_was_not_tried_and_what_that_would_cost(data: F32, monkeypatch: pytest.MonkeyPatch) -> None:
-    tried = Candidates(*(np.full(3, residual) for residual in (2.0, 1.0, 1.1, 1.3)), full_trial_seconds=4.2)
+    tried = Candidates(np.full(3, 2.0), np.full(3, 1.0), np.full(3, 1.1), np.full(3, 1.3), full_trial_seconds=4.2)
     monkeypatch.setattr("recon.auto.trials_of", lambda *_: tried)
     because = recon.reconstruct(data, VIEWS, Auto()).settings["chosen_because"]
     assert "r2 1.3; r2 stopped after 25% of its steps" in because and "about 4.2 s" in because

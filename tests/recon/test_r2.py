@@ -11,6 +11,7 @@ import recon
 import recon.splatting.initialise
 from recon import R2, DataUse, RunControl
 from recon.assess.metrics import psnr
+from recon.base.choices import Start
 from recon.base.kernel import Kernel, RayModel
 from recon.splatting.settings import FitSettings
 from recon.voxels.projector import Projector
@@ -166,7 +167,7 @@ def test_pixels_brighter_than_the_beam_do_not_rule_a_poisson_fit(phantom: Phanto
 
 @pytest.mark.slow
 @pytest.mark.parametrize("start", ["fbp", pytest.param("tv", marks=pytest.mark.slow)])
-def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: recon.splatting.initialise.Start) -> None:
+def test_a_cone_beam_scan_is_fitted(phantom: Phantom, start: Start) -> None:
     # Data of the voxel projector: nothing of the fit's own formulas.
     truth = phantom.attenuation(GRID)
     around = np.linspace(0, 2 * np.pi, 30, endpoint=False)

@@ -155,7 +155,7 @@ def test_classical_methods_by_the_same_call_beat_fbp(
     seen: list[int] = []
     chosen = build(by_name(method), {"iterations": iterations})
     result = recon.reconstruct(
-        noisy, VIEWS, chosen, control=RunControl(on_progress=lambda p: p.unit or seen.append(p.step))
+        noisy, VIEWS, chosen, control=RunControl(on_progress=lambda p: None if p.unit else seen.append(p.step))
     )
     assert psnr(truth, result.volume.data) > baseline + margin
     assert seen == list(range(1, iterations + 1)) and result.history[-1].residual < 0.2
@@ -190,7 +190,8 @@ def test_masked_values_are_as_those_that_are_not_finite_or_refused(noisy: np.nda
     with pytest.warns(UserWarning, match="960 of 19200 values .* are not finite"):
         volumes = [recon.reconstruct(each, VIEWS, "fbp").volume.data for each in (masked, [*masked], unseen)]
     assert np.array_equal(volumes[0], volumes[2]) and np.array_equal(volumes[1], volumes[2])
-    assert np.array_equal(*(recon.reconstruct(each, VIEWS, "fbp").volume.data for each in (nothing_masked, noisy)))
+    one, other = (recon.reconstruct(each, VIEWS, "fbp").volume.data for each in (nothing_masked, noisy))
+    assert np.array_equal(one, other)
     light, dark = np.round(2e4 * np.exp(-noisy)).astype(np.uint16), np.zeros(SHAPE, np.float32)
     flat = np.full((2, *SHAPE), 2e4, np.float32)
     counted = np.ma.array(np.where(hole, 65535, light), mask=hole)

@@ -24,6 +24,6 @@ def test_no_ray_of_the_middle_rows_leaves_their_box() -> None:
 
     data = Projector(views, grid).forward(column(grid))
     part, _ = part_of(ReconProblem(data, views, grid, DataUse(), 0, "cpu"))
-    assert part.grid.shape[0] * part.grid.spacing[0] < 0.7 * grid.shape[0] * grid.spacing[0]
+    assert part is not None and part.grid.shape[0] * part.grid.spacing[0] < 0.7 * grid.shape[0] * grid.spacing[0]
     found = Projector(part.geometry, part.grid).forward(column(part.grid))
     np.testing.assert_allclose(found, part.projections, atol=0.005 * data.max())

@@ -118,7 +118,7 @@ def test_a_toy_is_of_the_same_kind(turn: float) -> None:
 
 def test_it_counts_what_it_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     def compiles(*_: object, **__: object) -> None:
-        for _ in range(2):
+        for _time in range(2):
             numba.njit(lambda x: x + 1)(1.0)
 
     monkeypatch.setattr(module, "reconstruct", compiles)

@@ -51,7 +51,7 @@ def test_the_box_is_what_the_full_turn_sees_whatever_views_are_taken() -> None:
     ids=lambda method: method.name,
 )  # fmt: skip
 @pytest.mark.usefixtures("one_thread")
-def test_every_method_gives_the_density_of_the_sample(lines: np.ndarray, method: object) -> None:
+def test_every_method_gives_the_density_of_the_sample(lines: np.ndarray, method: recon.Method) -> None:
     """Before, those that iterate gave 0.026 for 0.020: what lay beyond one voxel a column was put into the others."""
     volume = recon.reconstruct(lines, VIEWS, method).volume
     truth = SAMPLE.attenuation(volume.grid)[0]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from drivers.testing.stages.bench import emitted
+from drivers.testing.stages.bench import EmittedPulse, emitted
 from simulators.devices.clock import VirtualClock
-from simulators.devices.trigger_line import Pulse, TriggerLine
+from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.wire import PM16CBuild
 from tests.drivers.stages.flat_settings import flat
 
@@ -45,7 +45,7 @@ class Wire:
         self.tell(*commands)
         self.clock.sleep(3600.0)
 
-    def pulses(self) -> list[Pulse]:
+    def pulses(self) -> list[EmittedPulse]:
         return emitted(self.line, self.clock)
 
     def counts(self) -> list[int]:

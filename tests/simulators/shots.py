@@ -29,7 +29,7 @@ def never(time: float) -> float:
 def shot(**changes: Any) -> Shot:
     """10 ms of 60 x 80 pixels of 10 um in the middle of the sensor, the sample at 0.4 rad; reading the stage's angle
     at another time fails."""
-    values = {
+    values: dict[str, Any] = {
         "detector": Detector.centred((60, 80), 0.01),
         "exposure": 0.01,
         "time": 1000.0,

@@ -53,7 +53,7 @@ def test_pairs_of_flats_give_back_gain_offset_and_read_noise(readout: str, binni
     dark = _frame(scene, 1.0, 99, beam=False, readout=readout, binning=binning, roi=roi)
     good = dark < np.median(dark) + 10 * READ_NOISE[readout] * binning / CONVERSION[readout]
     assert 0.99 < good.mean() < 1
-    mean, variance = np.array([_pair(*frames[2 * k : 2 * k + 2], good) for k in range(light.size)]).T
+    mean, variance = np.array([_pair(frames[2 * k], frames[2 * k + 1], good) for k in range(light.size)]).T
     weight = 1 / variance  # relative errors of the variances are alike
     # mean = offset + slope exposure;  variance = (read noise / gain)² + 1/12 + (mean - offset) / gain
     slope, offset = np.polyfit(light, mean, 1, w=1 / np.sqrt(variance))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from drivers.testing.stages.bench import emitted
+from drivers.testing.stages.bench import EmittedPulse, emitted
 from simulators.devices.clock import VirtualClock
-from simulators.devices.trigger_line import Pulse, TriggerLine
+from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.zaber.wire import ZaberBuild
 from tests.drivers.stages.flat_settings import flat
 
@@ -61,7 +61,7 @@ class Wire:
         self.do(*words)
         self.clock.sleep(3600.0)
 
-    def pulses(self) -> list[Pulse]:
+    def pulses(self) -> list[EmittedPulse]:
         return emitted(self.line, self.clock)
 
     def counts(self) -> list[int]:

@@ -116,7 +116,7 @@ def main() -> None:
         for module in _MODULES[words[0]].split():
             import_module(f"beamline.{module}")
     runner.run_trial = _made_up
-    figures.canvas = BlankCanvas  # type: ignore[assignment]
+    figures.canvas = BlankCanvas
     os.chdir(folder)
     out, counted = Path("out"), Path("count")
 

@@ -59,9 +59,7 @@ def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:
     assert done.exit_code == 0, done.output
     with h5py.File(output) as file:
         found: list[str] = []
-        file.visititems(
-            lambda name, node: found.append(node[()].decode()) if name.endswith("/background") else None  # type: ignore[func-returns-value]
-        )
+        file.visititems(lambda name, node: found.append(node[()].decode()) if name.endswith("/background") else None)
     return done.output, found[0]
 
 

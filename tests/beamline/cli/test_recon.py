@@ -172,7 +172,7 @@ def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None
     assert (found["tilt_deg"], found["distortion_col"], found["distortion_factors"]) == (-0.5, 20.0, "(1.0, 1e-05)")
     assert "Views are turned by -0.5 degrees." in result.stderr
     assert "Views are turned by -0.5 degrees." in (folder / "scan_fbp.html").read_text(encoding="utf-8")
-    for options, error, code in (
+    for wrong, error, code in (
         (("--tilt", "90"), "neither auto nor degrees within 45 of 0", 2),
         (("--tilt", "auto", "--follow"), "--tilt auto is for a finished scan", 2),
         (("--tilt", "auto"), "the tilt of the axis was not found: 2 bands of rows", 5),
@@ -180,7 +180,7 @@ def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None
         (("--distortion", "scan.h5"), "scan.h5:", 2),
         (("--distortion", "recipe.yaml"), "expected the lines 'xcenter = X'", 2),
     ):
-        result = beamline("recon", "scan.h5", *options, "-o", "other.h5")
+        result = beamline("recon", "scan.h5", *wrong, "-o", "other.h5")
         text = " ".join(result.stderr.replace("│", " ").split())
         assert (result.exit_code, error in text) == (code, True), result.stderr
     assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html", "lens.txt", "recipe.yaml"}

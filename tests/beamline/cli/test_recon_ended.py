@@ -11,6 +11,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.reconstruct import checkpoints, job, pipeline
+from beamline.reconstruct.record import write_result
 from beamline.storage.writers.recon_file import read_reconstruction
 from recon.base.method import Progress
 from recon.splatting import optimise as fit
@@ -146,7 +147,7 @@ def test_an_interrupted_fit_goes_on_from_its_checkpoint(folder: Path, monkeypatc
 def test_ctrl_c_while_a_volume_is_measured_and_written_does_not_discard_it(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write = pipeline.write_result
+    write = write_result
 
     def interrupted(*arguments: Any) -> Any:
         signal.raise_signal(signal.SIGINT)

@@ -285,7 +285,7 @@ def test_130_an_interrupt_before_anything_was_acquired(tmp_path: Path, monkeypat
 
 
 def test_a_shutter_moved_by_hand_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    instrument, asked = FakeInstrument(), []
+    instrument, asked = FakeInstrument(), list[str]()
     monkeypatch.setattr("beamline.instrument.connect.ask_operator", asked.append)
 
     def connect(config: object, clock: object, ask: Any, check_stop: object) -> Any:

@@ -28,7 +28,7 @@ def test_defaults_and_numbers_as_people_write_them(tmp_path: Path) -> None:
     assert (loaded.scan.flats.count, loaded.scan.flats.at) == (10, Place.START)
     assert loaded.devices.camera.roi == (0, 0, 8, 8)
     with pytest.raises(ValidationError):
-        loaded.scan.period_s = 1.0  # type: ignore[misc]
+        loaded.scan.period_s = 1.0
 
 
 PASSES = "scan.angles={scheme: interlaced, views: 12, passes: 3}"

@@ -59,7 +59,7 @@ def write(path: Path, text: str) -> Path:
 
 def pretend(monkeypatch: pytest.MonkeyPatch, folder: Path, own: str = "0::/user/session\n") -> Path:
     """A computer with 8 MB available, whose control groups a test fills in."""
-    monkeypatch.setattr(module.psutil, "virtual_memory", lambda: SimpleNamespace(available=8192 * KB))
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=8192 * KB))
     monkeypatch.setattr(module, "OWN_CGROUP", write(folder / "cgroup", own))
     monkeypatch.setattr(module, "CGROUPS", folder / "groups")
     return folder / "groups"

@@ -18,7 +18,7 @@ def test_what_the_disk_refuses_late_leaves_nothing(tmp_path: Path, monkeypatch: 
     def fsync(handle: int) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(files.os, "fsync", fsync)
+    monkeypatch.setattr("os.fsync", fsync)
     with pytest.raises(DataError, match=r".Input/output.*left of it"):
         write_whole(tmp_path / "page.html", "a page")
     with pytest.raises(DataError, match="Input/output error"), whole_file(tmp_path / "folder") as partial:

@@ -5,11 +5,12 @@ import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from beamline.config import load as config
+from beamline.config.load import camera_settings
 from beamline.config.stages import StageSection
 from beamline.core.errors import ConfigError
 from beamline.core.stop import ScanAborted
@@ -36,11 +37,11 @@ def test_dry_run_figures_are_what_the_devices_say(name: str, stage: str) -> None
     )
     limits, timing, to_counts = devices.describe(settings)
     with devices.connect(settings) as instrument:
-        stage, camera = instrument.devices.stage, instrument.devices.camera
-        camera.configure(devices.camera_settings(settings, settings.scan.exposure_s, TriggerSource.EXTERNAL))
-        assert stage.limits == limits
+        turned, camera = instrument.devices.stage, instrument.devices.camera
+        camera.configure(camera_settings(settings, settings.scan.exposure_s, TriggerSource.EXTERNAL))
+        assert turned.limits == limits
         assert camera.timing == timing
-        assert [to_counts(a) for a in (-0.1, 0, 1, 6.3)] == [stage.to_counts(a) for a in (-0.1, 0, 1, 6.3)]
+        assert [to_counts(a) for a in (-0.1, 0, 1, 6.3)] == [turned.to_counts(a) for a in (-0.1, 0, 1, 6.3)]
     assert math.degrees(limits.acceleration) <= 55  # the controller has only certain accelerations
 
 
@@ -152,7 +153,7 @@ def test_every_camera_option_reaches_the_driver(
         value = getattr(camera.options, field.name)
         assert value != getattr(default, field.name), field.name
         key = {"trigger_delay": "trigger_delay_s", "ring": "ring_mb"}.get(field.name, field.name)
-        assert value == said[key] * (1_000_000 if key == "ring_mb" else 1)
+        assert value == cast(float, said[key]) * (1_000_000 if key == "ring_mb" else 1)
     assert waited == [90]
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from beamline.config.load import camera_settings
 from beamline.config.models import Config, Speed
 from beamline.core.errors import ConfigError
 from beamline.instrument import connect as devices
@@ -70,7 +71,7 @@ def test_a_simulated_camera_that_takes_the_other_edge_is_refused_with_the_one_it
     with pytest.raises(ConfigError, match=f"active_high {str(not falling).lower()} .* set trigger_polarity {needed}"):
         small(f"devices.stage={STAGES[stage]}", f"devices.camera.trigger_polarity={other}")
     real = shipped("instrument", "devices.camera.trigger_polarity=negative")
-    assert real.devices.stage.active_high
+    assert real.devices.stage.settings.active_high
 
 
 @pytest.mark.parametrize("kind", ["pi_gcs", "zaber"])
@@ -83,7 +84,7 @@ def test_a_shutter_on_the_stage_s_output_lets_the_beam_through(kind: str, open_h
     )
     with devices.connect(settings) as instrument:
         camera, shutter = instrument.devices.camera, instrument.devices.shutter
-        camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
+        camera.configure(camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
         camera.arm(4)
 
         def brightest() -> int:
@@ -134,7 +135,7 @@ def test_step_darks_and_flats() -> None:
         stage, camera, shutter, sample = (
             getattr(instrument.devices, name) for name in ("stage", "camera", "shutter", "sample")
         )
-        camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
+        camera.configure(camera_settings(settings, 0.05, TriggerSource.SOFTWARE))
         camera.arm(3)
 
         def shot() -> np.ndarray:
@@ -172,7 +173,7 @@ def test_truth_lies_where_a_reconstruction_puts_it() -> None:
     """A region off the sensor's middle: z counts from the middle of the rows that were read."""
     settings = small("devices.camera.roi=[1136, 2020, 40, 56]")  # its rows' middle is 4 rows above the sensor's
     with devices.connect(settings) as instrument:
-        instrument.devices.camera.configure(devices.camera_settings(settings, 0.05, TriggerSource.EXTERNAL))
+        instrument.devices.camera.configure(camera_settings(settings, 0.05, TriggerSource.EXTERNAL))
         assert instrument.truth is not None
         volume = instrument.truth(Grid.matching(Geometry.parallel([0.0], (40, 56), pixel_pitch=4.6e-3)))
     z, y, x = (

@@ -46,7 +46,7 @@ class Blobs:
         cols = (COLS - 1) / 2 + radius * np.cos(view * self.step + phase) + shift[1]
         down = np.exp(-0.5 * ((np.arange(ROWS)[:, None] - self.rows - shift[0]) / self.sizes) ** 2)
         across = np.exp(-0.5 * ((np.arange(COLS)[:, None] - cols) / self.sizes) ** 2)
-        return (down * self.depths) @ across.T  # type: ignore[no-any-return]
+        return (down * self.depths) @ across.T
 
     def frames(self) -> Sequence[tuple[Frame, FrameDigest]]:
         frames = [self._frame(FrameKind.DARK, i, np.zeros((ROWS, COLS))) for i in range(5)]

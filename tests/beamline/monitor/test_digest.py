@@ -1,6 +1,7 @@
 """Digest against numpy and scipy, which know nothing of it."""
 
 import zlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_invalid_pixels_are_counted_and_never_spread(image: np.ndarray, bin_: in
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.float16, np.float32, np.float64])
-def test_block_means_of_other_types_are_of_the_valid_pixels(dtype: type) -> None:
+def test_block_means_of_other_types_are_of_the_valid_pixels(dtype: Any) -> None:
     image = np.random.default_rng(0).integers(0, 200, (9, 13)).astype(dtype)
     if image.dtype.kind == "f":
         image[:4, :4], image[5, 5], image[0, 7] = np.nan, np.inf, -np.inf

@@ -1,6 +1,6 @@
 """The field: places and pixels without light, a sample that goes on beyond it, and what enters or leaves it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -57,7 +57,7 @@ def test_a_sample_beyond_the_field_is_a_fact_about_the_scan(first: int, sides: s
 
 
 def of_pixels(fake: Any, frames: list[Frame]) -> list[Flag]:
-    return fake.flags(frames, checks=[PixelsCheck()])  # type: ignore[no-any-return]
+    return fake.flags(frames, checks=[PixelsCheck()])
 
 
 def with_dead_pixels(fake: Any, dead: list[tuple[int, int]], flats: int = 5) -> list[Frame]:
@@ -110,7 +110,7 @@ def test_views_with_pixels_that_hold_no_number_are_flagged_unless_the_darks_have
 SAMPLE = ((0.0, 0.0, 30.0, 0.02), (10.0, 5.0, 8.0, 0.05), (-12.0, 3.0, 6.0, 0.05))
 
 
-def total(discs: tuple[tuple[float, ...], ...]) -> float:
+def total(discs: Sequence[tuple[float, ...]]) -> float:
     """Area of each disc times its attenuation: the integral of the projection, from every side."""
     return sum(np.pi * radius**2 * attenuation for _, _, radius, attenuation in discs)
 

@@ -43,7 +43,7 @@ def test_checks_compare_with_the_mean_of_the_latest_group_of_references(fake: An
         if kind is not FrameKind.PROJECTION:
             mean = np.mean([digest(frame.counts, 65535, 4).preview for frame in frames], axis=0)
             found = state.context.dark if kind is FrameKind.DARK else state.context.flat
-            np.testing.assert_allclose(found, mean, rtol=1e-5)
+            np.testing.assert_allclose(np.asarray(found), mean, rtol=1e-5)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -223,7 +224,7 @@ VIOLATIONS = {
 
 
 @pytest.mark.parametrize(("changes", "sentence"), VIOLATIONS.values(), ids=VIOLATIONS.keys())
-def test_violations_have_values_and_advice(changes: dict[str, object], sentence: str) -> None:
+def test_violations_have_values_and_advice(changes: dict[str, Any], sentence: str) -> None:
     timeline = worked(replace(PLAN, **changes))
     (violation,) = timeline.violations
     assert sentence in violation
@@ -312,7 +313,7 @@ REMARKS = {
 
 
 @pytest.mark.parametrize(("changes", "sentence"), REMARKS.values(), ids=REMARKS.keys())
-def test_remarks_break_nothing(changes: dict[str, object], sentence: str) -> None:
+def test_remarks_break_nothing(changes: dict[str, Any], sentence: str) -> None:
     timeline = worked(replace(PLAN, **changes), camera=replace(CAMERA, min_period=0.051))
     assert timeline.violations == ()
     assert any(sentence in remark for remark in timeline.remarks), timeline.remarks

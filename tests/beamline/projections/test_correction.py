@@ -24,7 +24,7 @@ SCAN = TwoCylinders()
 PLAIN = Selection(steps=(Air("none"),))
 
 
-def correction_of(source: Any, selection: Selection, warn: Callable[[str], object] = pytest.fail) -> ScanCorrection:
+def correction_of(source: Any, selection: Selection, warn: Callable[[str], None] = pytest.fail) -> ScanCorrection:
     return ScanCorrection(source, selection, warn)
 
 

@@ -32,8 +32,8 @@ def scan(photons: float, n_flats: int = 20, n_darks: int = 10) -> ArraySource:
     """Darks, flats and views with so many photons a pixel in the open beam."""
     rng, shape = np.random.default_rng(3), SCAN.shape
     light = [np.zeros((n_darks, *shape)), np.full((n_flats, *shape), photons), photons * np.exp(-EXACT)]
-    counts = (DARK + GAIN * rng.poisson(some) + rng.normal(0, READOUT, some.shape) for some in light)
-    return scan_of(*counts, SCAN.angles, np.float32)
+    darks, flats, views = (DARK + GAIN * rng.poisson(some) + rng.normal(0, READOUT, some.shape) for some in light)
+    return scan_of(darks, flats, views, SCAN.angles, np.float32)
 
 
 def correction_of(source: Any, *steps: PrepStep, **chosen: Any) -> ScanCorrection:
@@ -80,7 +80,7 @@ def test_binned_pixels_and_means_of_frames_have_the_photons_of_all(
 ) -> None:
     """By the flats as they are read and by the gain of one pixel: a mean of four pixels has a quarter of the gain."""
     source = scan(20)
-    source.frames_per_view = frames  # type: ignore[misc]
+    source.frames_per_view = frames
     found = correction_of(source, Preparation(noise="counts", gain=gain), binning=binning)
     assert found.photons is not None
     assert found.photons.gain == pytest.approx(GAIN / of, rel=0.1)

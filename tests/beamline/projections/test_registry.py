@@ -6,6 +6,7 @@ import pytest
 
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.rings.rings import Rings
+from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import all_steps, recorded, registered, steps_of
 from beamline.projections.step import StepDone, key_of, options_of
 
@@ -27,7 +28,7 @@ def test_options_as_they_stand_are_the_steps_of_nothing_asked() -> None:
 
 
 def test_the_file_records_what_a_step_says_or_its_options() -> None:
-    steps = [Preparation("ignore", noise="counts", gain=2.0), Rings("vo")]
+    steps: list[PrepStep] = [Preparation("ignore", noise="counts", gain=2.0), Rings("vo")]
     done = {"rings": StepDone("none seen", {"rings_removed": "none seen"}), "noise": StepDone("counted")}
     expected = {
         "flags": "ignore",

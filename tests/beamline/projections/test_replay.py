@@ -76,7 +76,7 @@ def test_pixels_and_angles_that_are_no_measurement_are_named_and_nothing_else_fa
     data = np.concatenate([np.full((2, *SCAN.shape), DARK), np.full((2, *SCAN.shape), BEAM), views]).astype(dtype)
     data += np.arange(8)[:, None].astype(dtype)
     angles = np.r_[np.zeros(4), SCAN.angles]
-    own = {"dark": 1, "flat": 3, "view": 20, "all darks": slice(2), "all": slice(None)}
+    own: dict[str, Any] = {"dark": 1, "flat": 3, "view": 20, "all darks": slice(2), "all": slice(None)}
     if rows == "an angle":
         angles[20] = value
     elif rows == "half a view":
@@ -184,7 +184,7 @@ def test_a_check_that_fails_is_off_and_named_and_the_others_go_on() -> None:
     counts = np.r_[np.full((2, *SCAN.shape), DARK), np.full((2, *SCAN.shape), BEAM), SCAN.counts()]
     counts[20] = DARK
     key, angles = [2, 2, 1, 1] + [0] * 30, np.r_[np.zeros(4), SCAN.angles]
-    source = ArraySource(counts.astype(np.uint16), key, angles)
+    source: Any = ArraySource(counts.astype(np.uint16), key, angles)
     alone, beside = (verdict(source, list(replay(source, checks))) for checks in (CHECKS, (*CHECKS, Fails())))
     assert beside.kinds == alone.kinds and alone.alarmed == (20,)
     assert [text for text in beside.aside if text not in alone.aside] == [

@@ -57,7 +57,7 @@ def test_real_numbers_keep_their_range_and_those_that_are_none_are_counted(
     good = values[np.abs(values) < 1e10]
     np.testing.assert_allclose((views.mean, views.deviation), (good.mean(), good.std()), rtol=1e-5)
     expected = np.percentile(good, PERCENT, method="inverted_cdf")
-    np.testing.assert_allclose(views.percentiles, expected, atol=np.ptp(good) / 2**16)
+    np.testing.assert_allclose(views.percentiles, expected, atol=float(np.ptp(good)) / 2**16)
     assert (views.not_finite, views.saturated) == (pytest.approx(6 / 3000), 0.0)
     assert views.absolute == pytest.approx(np.abs(good).sum() / 5, rel=1e-5)
 

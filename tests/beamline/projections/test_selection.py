@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def test_selections_that_do_not_fit(tmp_path: Path, selection: Selection, said: 
 
 
 def test_the_central_ray_meets_the_row_that_is_given_whatever_rows_are_read() -> None:
-    source = scan_of(np.ones((1, 8, 6)), np.ones((1, 8, 6)), np.ones((3, 8, 6)), np.arange(3.0))
+    source: Any = scan_of(np.ones((1, 8, 6)), np.ones((1, 8, 6)), np.ones((3, 8, 6)), np.arange(3.0))
     cone = Selection(cone=(20, 40), pixel_size_mm=0.2, central_row=9.0)  # off the detector
     assert geometry_of(source, cone, 2.5, np.arange(3.0)).axis_row == 9
     half = replace(cone, rows=(2, 8), binning=2)

@@ -31,8 +31,8 @@ def scan(radius: float, light: np.ndarray | float = 1.0, beside: float = 0.0) ->
     rng = np.random.default_rng(2)
     open_beam = np.full((5, *SHAPE), 40_000.0)
     counts = [rng.poisson(0 * open_beam), rng.poisson(open_beam), rng.poisson(40_000 * light * np.exp(-lines))]
-    read = ((each + rng.integers(99, 102, each.shape)).clip(0, 65535) for each in counts)
-    return scan_of(*read, ANGLES)
+    darks, flats, views = ((each + rng.integers(99, 102, each.shape)).clip(0, 65535) for each in counts)
+    return scan_of(darks, flats, views, ANGLES)
 
 
 @pytest.mark.parametrize("radius", [45.0, 90.0, 180.0])

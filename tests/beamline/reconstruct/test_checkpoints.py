@@ -24,7 +24,7 @@ from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40))
-OTHERS = {"seed": 1, "start": "fbp"}
+OTHERS: dict[str, Any] = {"seed": 1, "start": "fbp"}
 SETTINGS = FitSettings()
 OTHER = next(kernel for kernel in Kernel if kernel is not SETTINGS.kernel)
 

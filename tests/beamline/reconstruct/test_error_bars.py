@@ -60,7 +60,7 @@ def test_the_file_holds_a_second_volume_with_its_unit(
         assert np.isfinite(errors).all() and np.median(errors) > 0
         np.testing.assert_array_equal(data, other["entry/data/data"])
         assert "data_errors" not in other["entry/data"]
-    assert read_reconstruction(made / name).parameters["error_bars_spread"] > 0
+    assert float(read_reconstruction(made / name).parameters["error_bars_spread"]) > 0
     assert beamline("validate", str(made / name)).exit_code == 0
 
 

@@ -17,10 +17,11 @@ from beamline.core.sinks import Warnings
 from beamline.projections.selection import Selection
 from beamline.reconstruct import live_fit as module
 from beamline.reconstruct import snapshots
-from beamline.reconstruct.live_fit import FollowState, ScanFollower
+from beamline.reconstruct.followed_views import FollowState
+from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.storage.writers.recon_file import read_reconstruction
+from beamline.storage.writers.recon_file import read_reconstruction, write_reconstruction
 from drivers.base.frame import Frame
 from recon.assess.metrics import psnr
 from recon.splatting.r2 import R2
@@ -215,7 +216,7 @@ def test_an_existing_result_stays(tmp_path: Path) -> None:
 
 
 def test_snapshots_a_viewer_holds_open_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = snapshots.write_reconstruction
+    real = write_reconstruction
 
     def write(path: Path, record: object, *, replace: bool = False) -> None:
         if "snapshot" in path.name:

@@ -14,12 +14,14 @@ import pytest
 from beamline.core.events import Event
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
-from beamline.projections.prepare import PreparedProjections, prepare_projections
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import UsableViews
 from beamline.reconstruct import pipeline
 from beamline.reconstruct.live_fit import ScanFollower
 from beamline.reconstruct.pipeline import reconstruct_file
+from beamline.reconstruct.record import write_result
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recon_record import ReconRecord
@@ -50,7 +52,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def judged(monkeypatch: pytest.MonkeyPatch) -> list[PreparedProjections]:
     """The views that volumes are judged by."""
     seen: list[PreparedProjections] = []
-    write = pipeline.write_result
+    write = write_result
 
     def write_and_keep(outcome: Reconstruction, prepared: PreparedProjections, *rest: Any) -> ReconRecord:
         seen.append(prepared)

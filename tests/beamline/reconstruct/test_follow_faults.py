@@ -107,4 +107,4 @@ def test_a_writer_that_is_killed_leaves_views_as_good_as_those_of_a_scan_that_wa
     recovered, stopped = (_quality(tmp_path / f"{name}.h5", ScanClock()) for name in ("recovered", "stopped"))
     assert recovered > stopped - ALLOWED
     frames = read_reconstruction(tmp_path / "recovered_recon.h5").parameters["view_frames"]
-    np.testing.assert_array_equal(frames, np.arange(4, 24))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(frames, np.arange(4, 24))

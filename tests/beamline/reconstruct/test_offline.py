@@ -152,7 +152,7 @@ def test_every_setting_is_in_the_file(tmp_path: Path) -> None:
     }
     assert {name: record.parameters[name] for name in said} == said
     np.testing.assert_array_equal(record.parameters["view_frames"], np.arange(4, 24))
-    np.testing.assert_allclose(record.parameters["view_angles_deg"], np.degrees(SCAN.angles[:20]))
+    np.testing.assert_allclose(np.asarray(record.parameters["view_angles_deg"]), np.degrees(SCAN.angles[:20]))
     assert Path(record.raw_file) == (tmp_path / "scan.h5").resolve()
 
 

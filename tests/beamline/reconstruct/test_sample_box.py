@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import box_around_sample
-from tests.beamline.array_source import ArraySource, scan_of
+from tests.beamline.array_source import scan_of
 
 ROWS, COLS, AXIS, BEAM, DARK = 24, 96, 50.0, 3000.0, 100
 ANGLES = np.radians(np.arange(0, 180, 3.0))
@@ -28,10 +29,11 @@ def cylinders(*bodies: tuple[float, float, float, float, slice]) -> NDArray[np.f
     return out
 
 
-def scan(depth: NDArray[np.float64], cone: tuple[float, float] | None = None) -> ArraySource:
+def scan(depth: NDArray[np.float64], cone: tuple[float, float] | None = None) -> Any:
     rng = np.random.default_rng(4)
     light = np.zeros((3, ROWS, COLS)), np.full((9, ROWS, COLS), BEAM), BEAM * np.exp(-depth)
-    source = scan_of(*(DARK + rng.poisson(each) for each in light), ANGLES)
+    darks, flats, views = (DARK + rng.poisson(each) for each in light)
+    source = scan_of(darks, flats, views, ANGLES)
     source.cone = cone
     return source
 

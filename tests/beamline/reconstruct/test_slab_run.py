@@ -11,6 +11,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from weakref import WeakSet
 
 import numpy as np
@@ -24,8 +25,10 @@ from recon.forecast import Forecast
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
 
-FISTA = ("recon", "scan.h5", "-m", "fista-tv", "--iterations", "2", "--tv-weight", "0.002", "--no-report")
-FISTA += ("--memory", "4.1M")
+FISTA = (
+    "recon", "scan.h5", "-m", "fista-tv", "--iterations", "2", "--tv-weight", "0.002", "--no-report",
+    "--memory", "4.1M",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +53,7 @@ def parts_and_whole(made: Path) -> tuple[ReconRecord, ReconRecord]:
 
 def interrupt_after(monkeypatch: pytest.MonkeyPatch, slabs: int, *, half: bool = False) -> None:
     """Ctrl-C when so many slabs were added; `half`: in the middle of adding the next one."""
-    add, added = PartialVolume.add, []
+    add, added = PartialVolume.add, list[Any]()
 
     def adding(self: PartialVolume, n: int, data: np.ndarray | None) -> None:
         if len(added) == slabs and not half:

@@ -53,7 +53,7 @@ def test_the_volume_is_the_same_to_the_bit_in_as_many_slabs_as_its_dry_run_says(
     assert result.exit_code == 0, result.output
     assert "scratch files" in result.stderr and "slices" in result.stderr
     parts = read_reconstruction(Path("parts.h5"))
-    assert planned["slabs"] == parts.parameters["slabs"] > 1
+    assert planned["slabs"] == int(parts.parameters["slabs"]) > 1
     np.testing.assert_array_equal(parts.volume.data, volume(*more, "--memory", "1G", "-o", "whole.h5"))
     whole = read_reconstruction(Path("whole.h5"))
     assert "slabs" not in whole.parameters and parts.metrics.keys() == whole.metrics.keys()

@@ -59,7 +59,7 @@ def test_a_finer_truth_is_averaged_onto_the_grid() -> None:
     for z, y, x in np.ndindex(2, 3, 4):
         block = DATA[2 * z : 2 * z + 2, 2 * y : 2 * y + 2, 2 * x : 2 * x + 2]
         assert fitted.data[z, y, x] == pytest.approx(block.mean())
-    np.testing.assert_array_equal(fit_truth(DATA, Grid(DATA.shape), 1).data, DATA)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(fit_truth(DATA, Grid(DATA.shape), 1).data, DATA)
     with pytest.raises(ConfigError, match=r"shape \(4, 6, 8\), the volume \(4, 6, 9\)"):
         fit_truth(DATA, Grid((4, 6, 9)), 1)
 

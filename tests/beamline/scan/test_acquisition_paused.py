@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import cast
 
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
 from beamline.core.stop import Cause, PauseRequest, ScanAborted, StopRequest
-from beamline.plan.passes import Choice
+from beamline.plan.passes import Choice, Passes
 from beamline.plan.plan import Mode, Place
 from beamline.scan.control import State, StateMachine
 from beamline.scan.supervision import Supervision
@@ -21,7 +22,7 @@ from drivers.base.frame import Frame, FrameKind
 from drivers.base.protocols import CameraFrame
 from drivers.in_beam import ManualShutter
 from tests.beamline.acquired import Run, assert_safe
-from tests.beamline.chosen import Chooser, Scripted
+from tests.beamline.chosen import Scripted
 from tests.beamline.fakes import Camera, Exposed, FakeInstrument, Faults, assert_true
 
 FIRST = 5  # triggers before the views: 3 darks and 2 flats
@@ -69,8 +70,8 @@ class Paused:
         clock, due = self.instrument.clock, sorted(self.instrument.clock.now() + at for at in seconds)
         sleep = clock.sleep
 
-        def on_the_way(s: float) -> None:
-            sleep(s)
+        def on_the_way(seconds: float) -> None:
+            sleep(seconds)
             while due and clock.now() >= due[0]:
                 due.pop(0)
                 self.pause.pause()
@@ -85,7 +86,7 @@ class Paused:
         passes: int = 1,
         at: Place = Place.START,
         speed: float = 30,
-        choose: Chooser | None = None,
+        choose: Callable[[Passes], Choice] | None = None,
     ) -> Run:
         supervision = Supervision(pause=self.pause, wait_in_pause=lambda: False, states=self.machine, next_pass=choose)
         return Run(self.instrument, self.instrument.timeline(n, mode, passes, at, speed), self.stop, supervision)

@@ -6,8 +6,8 @@ Every scan ends by name, safe, with true angles.
 import numpy as np
 import pytest
 
-from beamline.core.errors import DataError, InstrumentError
-from beamline.core.stop import Cause, ScanAborted, ScanStopped, StopRequest
+from beamline.core.errors import DataError, InstrumentError, ScanStopped
+from beamline.core.stop import Cause, ScanAborted, StopRequest
 from beamline.plan.plan import Mode, Place
 from beamline.scan.ledger import LedgerError
 from drivers.base.errors import DeviceError

@@ -36,7 +36,7 @@ def test_a_scan_waits_for_space_on_its_disk(tmp_path: Path, monkeypatch: pytest.
     """Another program takes it while the ninth frame is exposed, and gives it back when the scan has paused."""
     free = [10**12]
     monkeypatch.setattr(recorder, "LOOK", 0.01)
-    monkeypatch.setattr(recorder.shutil, "disk_usage", lambda path: SimpleNamespace(free=free[0]))
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=free[0]))
 
     def take() -> None:
         free[0] = 10**6
@@ -98,6 +98,7 @@ def test_a_step_scan_waits_for_a_slow_disk(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_a_slow_disk_pauses_views_but_no_darks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk: SlowDisk
     behind = {FrameKind.DARK: lambda: disk.waiting == 4, FrameKind.PROJECTION: lambda: disk.paused}
     disk = SlowDisk(monkeypatch, 4, behind)
     ran = Ran(tmp_path, FakeInstrument(), "scan.mode=fly", "scan.darks.count=12", heard=disk.heard)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import h5py
 import numpy as np
@@ -15,6 +15,7 @@ from beamline.core.errors import ConfigError
 from beamline.core.stop import StopRequest
 from beamline.features.tuning.tune import tune
 from beamline.instrument import connect as devices
+from beamline.instrument.connect import ConnectedDevices
 from beamline.instrument.states import device_states
 from beamline.scan.preflight import dry_run
 from beamline.scan.run import run_scan
@@ -95,7 +96,8 @@ def test_it_is_there_before_the_first_frame_and_in_the_file(
     kind, key, stands, in_file = DEVICES[name]
     frames: list[int] = []
     instrument = FakeInstrument(on_frame=lambda n: frames.append(len(instrument.log)))
-    instrument.devices = replace(instrument.devices, **{name: Recording(instrument, name, stands)})
+    changed: dict[str, Any] = {name: Recording(instrument, name, stands)}
+    instrument.devices = replace(instrument.devices, **changed)
     run = ran.Ran(tmp_path, instrument, kind, f"{key}={asked}")
     assert run.error is None and run.folder is not None
     told = [i for i, line in enumerate(instrument.log) if line.startswith(name)]
@@ -108,7 +110,9 @@ def test_it_is_there_before_the_first_frame_and_in_the_file(
 def test_one_that_does_not_obey_ends_the_scan_safely_without_a_frame(tmp_path: Path, name: str, asked: str) -> None:
     kind, key, stands, _ = DEVICES[name]
     instrument = FakeInstrument()
-    instrument.devices = replace(instrument.devices, **{name: Recording(instrument, name, stands, broken=True)})
+    instrument.devices = replace(
+        instrument.devices, **cast(Any, {name: Recording(instrument, name, stands, broken=True)})
+    )
     run = ran.Ran(tmp_path, instrument, kind, f"{key}={asked}")
     assert isinstance(run.error, DeviceError) and "it is stuck" in str(run.error)
     assert "close shutter" in instrument.log
@@ -118,6 +122,7 @@ def test_one_that_does_not_obey_ends_the_scan_safely_without_a_frame(tmp_path: P
 def test_a_motor_brings_it_there_for_a_scan_and_for_tune(tmp_path: Path) -> None:
     places = f"devices.filter={{kind: stage, places: {{none: 0, Cu: 12}}, stage: {MOTOR}}}"
     settings = small(places, "scan.filter=Cu", *SHORT)
+    on: ConnectedDevices
     for act in (lambda: run_scan(settings, tmp_path, instrument=on), lambda: tune(settings, on, StopRequest(), print)):
         with devices.connect(settings) as on:
             assert isinstance(on.devices.filter, PlacedStage) and on.devices.filter.place() == "none"
@@ -189,7 +194,7 @@ def test_a_beam_of_many_energies_has_no_monochromator() -> None:
 
 
 URL = f"pva://{PREFIX}it"
-STANDS = {
+STANDS: dict[str, tuple[str, dict[float, Any]]] = {
     "filter": (
         f"{{kind: epics, pv: '{URL}', places: {{none: 0, Cu: 2}}, timeout_s: 0.5}}",
         {2.0: {"place": "Cu"}, 1.0: {"place": "none that has a name"}},

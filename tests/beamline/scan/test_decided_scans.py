@@ -231,8 +231,8 @@ def test_a_choice_that_was_due_is_asked_for_before_any_frame_and_enough_takes_wh
 ) -> None:
     """Of a scan without references at its start, which is paused when it asks for the second time."""
     stop, events = StopRequest(), list[Event]()
-    words = (*PASSES, "scan.decide=ask", "scan.wait_s=300", "scan.darks.at=none", "scan.flats.at=end")
-    words = (*words, "scan.wide_views=2", "sample.diameter_mm=0.9")
+    words = [*PASSES, "scan.decide=ask", "scan.wait_s=300", "scan.darks.at=none", "scan.flats.at=end"]
+    words += ["scan.wide_views=2", "sample.diameter_mm=0.9"]
 
     def stop_when_asked(event: Event) -> None:
         if event.data.get("state") == State.ASKING:

@@ -1,10 +1,13 @@
 """Scans with a sample that a motor moves, and with a stage behind a motor record, on the simulated instrument."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from beamline.config.load import Config
 from beamline.core.events import Event
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument import connect as devices
@@ -27,7 +30,7 @@ MOVERS = {
 SHORT = ("scan.angles={scheme: fixed, views: 6}", "scan.flats={count: 2, at: both}", "scan.darks={count: 2}")
 
 
-def _frames(settings: devices.Config) -> list[Frame]:
+def _frames(settings: Config) -> list[Frame]:
     with devices.connect(settings) as instrument:
         ready = preflight(settings, instrument, Path())
         scan = Acquisition(instrument.devices, ready.timeline, ready.settings, 0.1, instrument.clock, StopRequest())
@@ -67,9 +70,9 @@ def test_an_ioc_that_dies_in_a_scan_ends_it_and_leaves_what_obeys_safe(monkeypat
         serve_pva(record_of(clock, TriggerLine(clock)), clock, monkeypatch) as ioc,
         devices.connect(settings, clock) as instrument,
     ):
-        behind = settings.devices.stage.settings
+        behind: Any = settings.devices.stage.settings
         stage = EpicsStage(f"pva://{PREFIX}", behind, clock)
-        used = devices.replace(instrument.devices, stage=stage)
+        used = replace(instrument.devices, stage=stage)
         ready = preflight(settings, instrument, Path())
         scan = Acquisition(used, ready.timeline, ready.settings, 0.1, clock, StopRequest())
         frames = []

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from beamline.core.stop import ScanStopped, StopRequest
+from beamline.core.errors import ScanStopped
+from beamline.core.stop import StopRequest
 from beamline.features.files.validate import describe, validate
 from beamline.projections.replay import judged_flags
 from beamline.projections.usable_views import usable_views

@@ -217,7 +217,7 @@ def bluesky(held: Held) -> Surface:
     return lambda: asyncio.run(plan()), nullcontext(lambda verb: ends.set())
 
 
-NEEDS = {epics: "p4p", bluesky: "ophyd_async"}
+NEEDS: dict[Callable[[Held], Surface], str] = {epics: "p4p", bluesky: "ophyd_async"}
 
 
 def seconds_of(surface: Callable[[Held], Surface], state: Moment, verb: str, mode: str, runs: Path) -> dict[str, float]:

@@ -102,7 +102,7 @@ def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
         assert "a program that was killed, or lost this stage, left" in text and not list(
             (tmp_path / "state").rglob("*.json")
         )
-        assert before is None or speed.settings == before
+        assert speed is None or speed.settings == before
         log.unlink()
         told: list[str] = []
         with watched(tmp_path, lambda event: told.append(event.event)):
@@ -119,7 +119,7 @@ def test_what_cannot_be_said_or_done_keeps_no_other_step_from_being_tried(
 
     def safe(config: Config, clock: Clock, say: Callable[[str], None]) -> bool:
         say("The stage was told to stop.")
-        made.append(watchdog._insist(lambda: 1 / 0, VirtualClock(), say, "never"))  # type: ignore[arg-type, return-value]
+        made.append(watchdog._insist(lambda: 1 / 0, VirtualClock(), say, "never"))  # type: ignore[arg-type]
         return True
 
     monkeypatch.setattr(watchdog, "make_safe", safe)

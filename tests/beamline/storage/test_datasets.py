@@ -13,6 +13,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.features.files.validate import describe, validate
 from beamline.storage import datasets
+from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.readers.open import open_scan
 from tests.beamline.storage.readers import foreign_scans
 
@@ -100,8 +101,8 @@ def test_a_source_is_opened_once_however_often_it_is_drawn_on(tmp_path: Path, mo
     virtual(tmp_path, "frames.h5", *(("0.h5", slice(i, i + 1)) for i in range(8)))
     for k in range(12):
         virtual(tmp_path, f"{k + 1}.h5", (f"{k}.h5", slice(0, 4)), (f"{k}.h5", slice(4, 8)))
-    opened, really = list[str](), datasets.open_hdf5
-    monkeypatch.setattr(datasets, "open_hdf5", lambda path: opened.append(path.name) or really(path))  # type: ignore[func-returns-value]
+    opened, really = list[str](), open_hdf5
+    monkeypatch.setattr(datasets, "open_hdf5", lambda path: opened.append(path.name) or really(path))
     for name, times in (("frames.h5", 1), ("12.h5", 12)):
         opened.clear()
         with h5py.File(tmp_path / name) as file:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -106,7 +107,7 @@ def test_volume_file_checkpoint_and_their_events(tmp_path: Path) -> None:
     assert re.match("The scan ended as 'stopped' after 49 frames. Enough.", str(record.parameters["scan_ended"]))
     fitted, centres = read_reconstruction(tmp_path / "r2.h5"), np.ones((SCAN.angles.size, 3))
     rest = {"view_centres_mm": centres, "roi": "0:4,0:4,0:4", "roi_found": "4 of 8 slices", "frames_per_view": 2}
-    parameters = {**fitted.parameters, **rest}
+    parameters: dict[str, Any] = {**fitted.parameters, **rest}
     model = {**fitted.model, "view_centres": centres}
     write_reconstruction(tmp_path / "free.h5", replace(fitted, parameters=parameters, model=model))
     series = VolumeSeries(np.zeros(2), np.stack([record.volume.data] * 2))

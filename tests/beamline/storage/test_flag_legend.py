@@ -80,8 +80,9 @@ def test_scores_and_regions_stand_beside_the_bits(path: Path, tmp_path: Path) ->
             assert tuple(flags.regions[2, mass]) == REGION["mass"]
             assert (np.delete(flags.regions.reshape(4, -1), 2, axis=0) == -1).all()
             shifted = FrameFlags.joined([None, flags], [2, flags.bits.size])
-            np.testing.assert_array_equal(shifted.scores[2:], flags.scores)  # type: ignore[index]
-            assert shifted.of(shifted.alarmed).regions.shape == (1, len(NAMES), 4)  # type: ignore[union-attr]
+            assert shifted is not None and shifted.scores is not None
+            np.testing.assert_array_equal(shifted.scores[2:], flags.scores)
+            assert shifted.of(shifted.alarmed).regions.shape == (1, len(NAMES), 4)
     with h5py.File(path) as file:
         assert file["entry/frame_log/frame_valid"][()].tolist() == [1, 1, 0, 1]
         pixels = file["entry/instrument/detector/data"][()]
@@ -131,7 +132,6 @@ def test_counting_undoes_the_bitmask(found: list[dict[str, Level]]) -> None:
             assert flags.counts().get(name, {}).get(str(level), 0) == n
     assert flags.flagged.tolist() == [bool(frame) for frame in found]
     assert flags.alarmed.tolist() == [Level.ALARM in frame.values() for frame in found]
-    assert (
-        FrameFlags.joined([None, flags], [3, flags.bits.size]).alarmed.tolist() == [False] * 3 + flags.alarmed.tolist()
-    )
+    after = FrameFlags.joined([None, flags], [3, flags.bits.size])
+    assert after is not None and after.alarmed.tolist() == [False] * 3 + flags.alarmed.tolist()
     assert flags.of(flags.alarmed).flagged.all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,17 @@ from beamline.storage import datasets
 from beamline.storage.readers.open import SourceOptions, open_scan
 
 NAN = np.nan
+int8, int16, uint16, float32 = (partial(np.array, dtype=kind) for kind in (np.int8, np.int16, np.uint16, np.float32))
 CASES: dict[str, tuple[np.ndarray, dict[str, Any], list[float]]] = {
-    "scale and offset": (np.int16([-2, 0, 3]), {"scale_factor": 0.5, "add_offset": 1.0}, [0, 1, 2.5]),
+    "scale and offset": (int16([-2, 0, 3]), {"scale_factor": 0.5, "add_offset": 1.0}, [0, 1, 2.5]),
     "the other byte order": (np.array([-2, 3], ">i2"), {"scale_factor": np.float32(2)}, [-4, 6]),
-    "fills": (np.uint16([1, 2, 9]), {"_FillValue": np.uint16(9), "missing_value": [2, -1]}, [1, NAN, NAN]),
-    "a fill of reals": (np.float32([1, -9, NAN]), {"_FillValue": np.float32(-9), "scale_factor": 2.0}, [2, NAN, NAN]),
-    "limits as stored": (np.int16([1, 5, 9]), {"valid_range": np.int16([2, 8]), "scale_factor": 10.0}, [NAN, 50, NAN]),
-    "limits of values": (np.int16([1, 5, 9]), {"valid_range": [20.0, 80.0], "scale_factor": 10.0}, [NAN, 50, NAN]),
-    "one limit": (np.int16([1, 5, 9]), {"valid_min": np.int16(5)}, [NAN, 5, 9]),
-    "a negative scale": (np.int16([1, 5, 9]), {"valid_range": [-60.0, -20.0], "scale_factor": -10.0}, [NAN, -50, NAN]),
-    "unsigned": (np.int8([1, -2, -1]), {"_Unsigned": "true", "_FillValue": np.int8(-1)}, [1, 254, NAN]),
+    "fills": (uint16([1, 2, 9]), {"_FillValue": np.uint16(9), "missing_value": [2, -1]}, [1, NAN, NAN]),
+    "a fill of reals": (float32([1, -9, NAN]), {"_FillValue": np.float32(-9), "scale_factor": 2.0}, [2, NAN, NAN]),
+    "limits as stored": (int16([1, 5, 9]), {"valid_range": int16([2, 8]), "scale_factor": 10.0}, [NAN, 50, NAN]),
+    "limits of values": (int16([1, 5, 9]), {"valid_range": [20.0, 80.0], "scale_factor": 10.0}, [NAN, 50, NAN]),
+    "one limit": (int16([1, 5, 9]), {"valid_min": np.int16(5)}, [NAN, 5, 9]),
+    "a negative scale": (int16([1, 5, 9]), {"valid_range": [-60.0, -20.0], "scale_factor": -10.0}, [NAN, -50, NAN]),
+    "unsigned": (int8([1, -2, -1]), {"_Unsigned": "true", "_FillValue": np.int8(-1)}, [1, 254, NAN]),
 }
 
 
@@ -47,7 +49,7 @@ def test_values_of_cf(tmp_path: Path, case: str) -> None:
     "attributes",
     [
         {"scale_factor": 1.0, "add_offset": 0.0},
-        {"valid_range": np.uint16([0, 65535])},
+        {"valid_range": uint16([0, 65535])},
         {"offset": [1.0, 2.0, 3.0]},  # of NXtransformations
         {"scale": 1.0, "offset": 0.0},
         {"_FillValue": np.float32(NAN)},
@@ -85,7 +87,7 @@ def test_every_dataset_of_a_scan_is_packed_for_itself(tmp_path: Path) -> None:
         for name, (array, scale) in packed.items():
             file[f"exchange/{name}"] = array
             file[f"exchange/{name}"].attrs["scale_factor"] = scale
-        file["exchange/theta"] = np.int16([0, 360, 720, 1080, 1440])
+        file["exchange/theta"] = int16([0, 360, 720, 1080, 1440])
         file["exchange/theta"].attrs.update(units="deg", scale_factor=0.1)
     with open_scan(tmp_path / "s.h5") as source:
         assert (source.dtype, source.quantity) == (np.float32, "counts")
@@ -108,7 +110,7 @@ def test_a_scan_of_cil_and_its_cone(tmp_path: Path) -> None:
         }
         axes = {"detector/direction_x": (1, 0, 0), "detector/direction_y": (0, 0, 1)}
         for name, place in (places | axes).items():
-            file[f"{entry}/config/{name}"] = np.float32(place)
+            file[f"{entry}/config/{name}"] = float32(place)
         file[f"{entry}/config/angles"] = np.arange(9) * 40.0
         file[f"{entry}/config/angles"].attrs["angle_unit"] = "degree"
     options = SourceOptions(tmp_path / "s.nxs", data_path=f"{entry}/data/data", angles_path=f"{entry}/config/angles")

@@ -6,6 +6,7 @@ import gzip
 import struct
 import sys
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -22,7 +23,7 @@ def nifti(values: np.ndarray = VALUES, order: str = "<", **changed: object) -> b
     """A NIfTI-1 file by hand, field after field as the standard's table lists them; `changed` by name."""
     codes = {"u1": (2, 8), "i2": (4, 16), "i4": (8, 32), "f4": (16, 32), "f8": (64, 64), "u2": (512, 16)}
     code, bits = codes[values.dtype.str[1:]]
-    field: dict[str, object] = {
+    field: dict[str, Any] = {
         "size": 348,
         "dim": (3, *values.shape[::-1], 1, 1, 1, 1),
         "datatype": code,
@@ -41,7 +42,7 @@ def nifti(values: np.ndarray = VALUES, order: str = "<", **changed: object) -> b
         b"", b"", 0, 0, *[0.0] * 6, *[0.0] * 12, b"", field["magic"],
     )  # fmt: skip
     assert len(header) == 348
-    return header + b"\0" * 4 + values.astype(values.dtype.newbyteorder(order)).tobytes()
+    return header + b"\0" * 4 + values.astype(np.dtype(f"{order}{values.dtype.str[1:]}")).tobytes()
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

@@ -41,7 +41,7 @@ class FixedText:
         self.closed = True
 
 
-def monitor(text: str, pattern: str = RING, **options: float) -> BeamMonitor:
+def monitor(text: str, pattern: str = RING, **options: Any) -> BeamMonitor:
     return TextBeamMonitor(FixedText(text), VirtualClock(7.0), pattern=pattern, unit="mA", **options)
 
 

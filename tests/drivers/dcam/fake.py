@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from drivers.base.clock import Clock, SystemClock
 from drivers.dcam.camera import DcamCamera
 from drivers.orca_quest import DcamOptions
-from simulators.devices.trigger_line import TriggerLine
+from drivers.testing.stages.bench import EmittedPulse
 
 SENSOR = (48, 72)
 EXPOSURETIME, TIMING_READOUTTIME = 0x001F0110, 0x00403010
@@ -62,6 +63,12 @@ class VirtualTime:
         self._fake.fakedcam_sleep(max(seconds, 0.0))
 
 
+class Pulses(Protocol):
+    """A trigger cable."""
+
+    def next_after(self, time: float) -> EmittedPulse | None: ...
+
+
 class World:
     """Fires triggers at the fake camera and breaks things; it begins anew with every World, in virtual time."""
 
@@ -86,7 +93,7 @@ class World:
     def connect(self, options: DcamOptions | None = None) -> DcamCamera:
         return DcamCamera(self.path, clock=self.clock, options=options)
 
-    def plug(self, line: TriggerLine) -> None:
+    def plug(self, line: Pulses) -> None:
         """Connect the trigger input to a stage's output: the fake asks the line what comes next whenever it needs to.
 
         So pulses that a stage takes back, when it is stopped on the way, never come.

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.base.errors import DeviceError
 from drivers.dcam import abi, codes
-from tests.drivers.dcam.fake import compiler
+from tests.drivers.dcam.fake import World, compiler
 
 # Bytes on 64-bit machines, as the vendor's header and two independent bindings have them.
 STRUCTURES = {
@@ -34,13 +34,13 @@ def test_stamps_lie_where_the_vendor_puts_them() -> None:
     assert (frame.buffer.offset, frame.timestamp.offset, frame.framestamp.offset) == (16, 48, 56)
 
 
-def test_layout_is_that_of_a_c_compiler(world) -> None:
+def test_layout_is_that_of_a_c_compiler(world: World) -> None:
     c_layout = world.layout()
     declared = {value for value in vars(codes).values() if isinstance(value, type(ctypes.Structure))}
     assert {structure for structure, _ in STRUCTURES.values()} == declared  # none is left out
     assert set(c_layout) == set(STRUCTURES)
     for name, (structure, size) in STRUCTURES.items():
-        offsets = [getattr(structure, field).offset for field, _ in structure._fields_]
+        offsets = [getattr(structure, field).offset for field, *_ in structure._fields_]
         assert (ctypes.sizeof(structure), offsets) == (size, c_layout[name][1]) == (c_layout[name][0], offsets), name
 
 
@@ -109,12 +109,12 @@ def test_an_unknown_error_keeps_its_number() -> None:
     assert error.code == 0xFFFFFFFF
 
 
-def test_a_call_before_the_session_is_an_error_by_name(world) -> None:
+def test_a_call_before_the_session_is_an_error_by_name(world: World) -> None:
     with pytest.raises(abi.DcamError, match=r"'dcamdev_open index 0'.*UNLOADED \(0x80000F04\)"):
         abi.Dcam(world.path, "camera").dev_open(0)
 
 
-def test_a_wrong_size_field_is_seen_by_the_library(world) -> None:
+def test_a_wrong_size_field_is_seen_by_the_library(world: World) -> None:
     """The fake checks sizes as the real one does; that the other tests pass therefore means something."""
     library = ctypes.CDLL(str(world.path))
     library.dcamapi_init.restype = ctypes.c_int32

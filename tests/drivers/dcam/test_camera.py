@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
 
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.base.protocols import Camera, CameraSettings, TriggerSource
+from drivers.base.protocols import Camera, CameraFrame, CameraSettings, TriggerSource
 from drivers.dcam.abi import DcamError
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Error
 from drivers.orca_quest import SENSOR_SHAPE, DcamOptions
 from drivers.testing.camera import CameraBench, CameraConformance
+from tests.drivers.dcam.fake import World
 from tests.drivers.orca_bench import orca_bench, says_what_an_orca_says
 
 
 class TestDcamCamera(CameraConformance):
     @pytest.fixture
-    def bench(self, world) -> Iterator[CameraBench]:
+    def bench(self, world: World) -> Iterator[CameraBench]:
         world.reset(*SENSOR_SHAPE)
         camera = world.connect()
         yield orca_bench(camera, world.clock, world.schedule)
@@ -36,8 +38,11 @@ EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
 FRAME_BYTES = 48 * 72 * 2
 
 
+Waiting: TypeAlias = tuple[DcamCamera, Future[CameraFrame]]
+
+
 @pytest.fixture
-def small_ring(world):
+def small_ring(world: World) -> Iterator[DcamCamera]:
     """A camera whose ring has 4 slots, of which 3 are safe to read while it runs."""
     camera = world.connect(DcamOptions(ring=4 * FRAME_BYTES))
     camera.configure(EXTERNAL)
@@ -49,10 +54,10 @@ def take(camera: Camera, n: int) -> list[int]:
     return [camera.next_frame(1.0).framestamp for _ in range(n)]
 
 
-def test_every_pulse_is_a_frame_with_its_own_pixels_and_time(camera: DcamCamera, world) -> None:
+def test_every_pulse_is_a_frame_with_its_own_pixels_and_time(camera: DcamCamera, world: World) -> None:
     camera.arm(5)
     times = world.clock.now() + np.array([0.1, 0.3, 0.4, 0.5, 0.55])
-    world.schedule(times)
+    world.schedule(times.tolist())
     for stamp, time in enumerate(times):
         frame = camera.next_frame(1.0)
         assert frame.framestamp == stamp
@@ -63,7 +68,7 @@ def test_every_pulse_is_a_frame_with_its_own_pixels_and_time(camera: DcamCamera,
 
 @pytest.mark.parametrize("pad", [0, 6, 1024])
 @pytest.mark.parametrize(("roi", "binning"), [((8, 12, 32, 40), 1), ((4, 16, 40, 24), 2)])
-def test_rows_of_the_ring_may_be_padded(camera: DcamCamera, world, pad: int, roi, binning: int) -> None:
+def test_rows_of_the_ring_may_be_padded(camera: DcamCamera, world: World, pad: int, roi: Any, binning: int) -> None:
     world.fault("pad", pad)
     camera.configure(replace(EXTERNAL, roi=roi, binning=binning))
     camera.arm(1)
@@ -71,7 +76,7 @@ def test_rows_of_the_ring_may_be_padded(camera: DcamCamera, world, pad: int, roi
     np.testing.assert_array_equal(camera.next_frame(1.0).counts, world.pattern(0, roi, binning))
 
 
-def test_an_overrun_ring_is_an_error_that_leaves_a_gap_and_a_count(small_ring: DcamCamera, world) -> None:
+def test_an_overrun_ring_is_an_error_that_leaves_a_gap_and_a_count(small_ring: DcamCamera, world: World) -> None:
     """10 frames into 4 slots: 6 are gone and the oldest of the 4 may go at any moment."""
     small_ring.arm(100)
     world.pulses(10)
@@ -87,7 +92,7 @@ def test_an_overrun_ring_is_an_error_that_leaves_a_gap_and_a_count(small_ring: D
     assert small_ring.describe()["frames_overwritten"] == 14
 
 
-def test_a_frame_lost_on_the_way_leaves_a_gap(camera: DcamCamera, world) -> None:
+def test_a_frame_lost_on_the_way_leaves_a_gap(camera: DcamCamera, world: World) -> None:
     camera.arm(5)
     world.pulses(2)
     world.fault("drop", 1)
@@ -100,7 +105,7 @@ def test_a_frame_lost_on_the_way_leaves_a_gap(camera: DcamCamera, world) -> None
 
 
 @pytest.mark.parametrize("origin", [0, 1])
-def test_a_lost_first_frame_shows_whatever_number_the_camera_begins_with(world, origin: int) -> None:
+def test_a_lost_first_frame_shows_whatever_number_the_camera_begins_with(world: World, origin: int) -> None:
     world.fault("first_stamp", origin)
     camera = world.connect()
     camera.configure(EXTERNAL)
@@ -111,7 +116,7 @@ def test_a_lost_first_frame_shows_whatever_number_the_camera_begins_with(world, 
     camera.close()
 
 
-def test_framestamps_that_go_on_over_captures_count_from_a_run_s_first_frame(world) -> None:
+def test_framestamps_that_go_on_over_captures_count_from_a_run_s_first_frame(world: World) -> None:
     """The fact sheet has it from memory that they begin anew; else every frame of a run would seem to be lost."""
     world.fault("stamps_go_on")
     camera = world.connect()
@@ -127,7 +132,7 @@ def test_framestamps_that_go_on_over_captures_count_from_a_run_s_first_frame(wor
     camera.close()
 
 
-def test_a_count_of_frames_that_goes_back_is_said_and_not_waited_out(camera: DcamCamera, world) -> None:
+def test_a_count_of_frames_that_goes_back_is_said_and_not_waited_out(camera: DcamCamera, world: World) -> None:
     camera.arm(5)
     world.pulses(3)
     assert take(camera, 3) == [0, 1, 2]
@@ -136,14 +141,14 @@ def test_a_count_of_frames_that_goes_back_is_said_and_not_waited_out(camera: Dca
         camera.next_frame(1.0)
 
 
-def test_a_state_that_the_interface_does_not_have_is_an_error_of_the_device(camera: DcamCamera, world) -> None:
+def test_a_state_that_the_interface_does_not_have_is_an_error_of_the_device(camera: DcamCamera, world: World) -> None:
     camera.arm(1)
     world.fault("odd_status", 9)
     with pytest.raises(DeviceError, match="status is 9"):
         camera.next_frame(1.0)
 
 
-def test_arm_returns_only_when_triggers_are_taken(camera: DcamCamera, world) -> None:
+def test_arm_returns_only_when_triggers_are_taken(camera: DcamCamera, world: World) -> None:
     world.fault("start_polls", 3)
     camera.arm(1)
     assert world.pulse()
@@ -151,7 +156,7 @@ def test_arm_returns_only_when_triggers_are_taken(camera: DcamCamera, world) -> 
 
 
 @pytest.fixture
-def waiting(world, request: pytest.FixtureRequest):
+def waiting(world: World, request: pytest.FixtureRequest) -> Iterator[Waiting]:
     """A camera in real time with a thread that waits for its first frame, and that frame's future.
 
     Its parameter is a fault that the camera has from the beginning.
@@ -170,7 +175,7 @@ def waiting(world, request: pytest.FixtureRequest):
     camera.close()
 
 
-def test_an_event_that_never_comes_delays_but_does_not_lose_a_frame(waiting, world) -> None:
+def test_an_event_that_never_comes_delays_but_does_not_lose_a_frame(waiting: Waiting, world: World) -> None:
     _, frame = waiting
     world.fault("swallow_events", 1)
     world.schedule([world.clock.now()])
@@ -178,7 +183,7 @@ def test_an_event_that_never_comes_delays_but_does_not_lose_a_frame(waiting, wor
 
 
 @pytest.mark.parametrize("waiting", [None, "no_stopped_event"], indirect=True)
-def test_disarm_ends_a_wait_in_another_thread(waiting, world) -> None:
+def test_disarm_ends_a_wait_in_another_thread(waiting: Waiting, world: World) -> None:
     """Also where the camera cannot signal that it stopped: the wait itself is aborted."""
     camera, frame = waiting
     aborted = world.calls("dcamwait_abort")
@@ -188,7 +193,7 @@ def test_disarm_ends_a_wait_in_another_thread(waiting, world) -> None:
     assert world.calls("dcamwait_abort") == aborted + 1
 
 
-def test_close_waits_for_the_thread_that_is_in_the_library(waiting, world) -> None:
+def test_close_waits_for_the_thread_that_is_in_the_library(waiting: Waiting, world: World) -> None:
     camera, frame = waiting
     world.fault("slow_to_wake", 50)  # ms; the fake refuses to close a wait handle that somebody waits with
     camera.close()
@@ -197,7 +202,7 @@ def test_close_waits_for_the_thread_that_is_in_the_library(waiting, world) -> No
     assert (world.live, world.waiters) == (0, 0)
 
 
-def test_a_capture_that_ends_by_itself_gives_its_frames_first(camera: DcamCamera, world) -> None:
+def test_a_capture_that_ends_by_itself_gives_its_frames_first(camera: DcamCamera, world: World) -> None:
     camera.arm(3)
     world.pulses(2)
     world.stop()
@@ -207,7 +212,7 @@ def test_a_capture_that_ends_by_itself_gives_its_frames_first(camera: DcamCamera
     camera.disarm()  # the library answers "nothing to do", which is no failure
 
 
-def test_a_ring_is_freed_though_the_stop_fails(camera: DcamCamera, world) -> None:
+def test_a_ring_is_freed_though_the_stop_fails(camera: DcamCamera, world: World) -> None:
     camera.arm(1)
     world.stop()  # by itself, so that the ring can be freed
     world.fail("dcamcap_stop", Error.FAILWRITECAMERA)
@@ -216,7 +221,7 @@ def test_a_ring_is_freed_though_the_stop_fails(camera: DcamCamera, world) -> Non
     assert world.live == 3  # session, camera, wait
 
 
-def test_no_memory_for_the_ring_leaves_it_disarmed(camera: DcamCamera, world) -> None:
+def test_no_memory_for_the_ring_leaves_it_disarmed(camera: DcamCamera, world: World) -> None:
     world.fault("no_memory")
     with pytest.raises(DcamError, match=r"NOMEMORY.*fewer bytes"):
         camera.arm(1)
@@ -224,13 +229,13 @@ def test_no_memory_for_the_ring_leaves_it_disarmed(camera: DcamCamera, world) ->
     camera.arm(1)
 
 
-def test_an_index_too_high_is_said(world) -> None:
+def test_an_index_too_high_is_said(world: World) -> None:
     with pytest.raises(DeviceError, match=r"camera 1."):
         DcamCamera(world.path, index=1)
     assert world.live == 0
 
 
-def test_a_camera_that_refuses_its_first_setting_is_let_go(world) -> None:
+def test_a_camera_that_refuses_its_first_setting_is_let_go(world: World) -> None:
     world.fault("refuse", 0x00100110)
     with pytest.raises(DeviceRefused, match="refuses TRIGGERSOURCE"):
         world.connect()

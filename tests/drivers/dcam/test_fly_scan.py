@@ -97,7 +97,7 @@ def fly(rig: FlyRig, interval: int, n: int, speed: float) -> list[CameraFrame]:
     rig.camera.arm(n)
     rig.stage.arm(TriggerTrain(start, interval, n))
     rig.stage.start_move(rig.stage.to_angle(start + interval * n + 20_000), speed * COUNT)
-    frames = []
+    frames: list[CameraFrame] = []
     while rig.stage.moving() or len(frames) < rig.world.exposed:
         try:
             frames.append(rig.camera.next_frame(0.05))
@@ -106,7 +106,7 @@ def fly(rig: FlyRig, interval: int, n: int, speed: float) -> list[CameraFrame]:
     return frames
 
 
-def test_pulses_that_a_stopped_stage_takes_back_never_come(world) -> None:
+def test_pulses_that_a_stopped_stage_takes_back_never_come(world: World) -> None:
     with FlyRig(world) as rig:
         start = COUNTS // 10
         rig.camera.configure(EXTERNAL)
@@ -152,7 +152,7 @@ class Scanned:
 
 @pytest.mark.slow
 def test_three_thousand_views_are_three_thousand_pulses_frames_and_rows(
-    world, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     views = 3000
     # On a virtual clock frames come faster than any disk takes them: they would be flown in pieces.
@@ -177,7 +177,7 @@ def test_three_thousand_views_are_three_thousand_pulses_frames_and_rows(
 
 
 def test_the_camera_captures_before_the_stage_is_armed_and_until_it_is_disarmed(
-    world, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    world: World, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pulse that comes before the camera is ready is lost without a word."""
     capturing: dict[str, list[bool]] = {}

@@ -98,7 +98,7 @@ def test_a_delay_moves_the_exposure_but_not_the_time_of_the_trigger(world: World
     with connected(world, trigger_delay=0.25) as camera:
         camera.arm(2)
         times = world.clock.now() + np.array([0.5, 1.5])
-        world.schedule(times)
+        world.schedule(times.tolist())
         assert [camera.next_frame(2.0).time for _ in times] == pytest.approx(times, abs=3e-6)
         readout = camera.timing.readout
         assert world.clock.now() == pytest.approx(times[-1] + 0.25 + 0.001 + readout, abs=1e-5)
@@ -112,7 +112,7 @@ def test_every_third_pulse_is_a_frame_and_pulses_may_be_three_times_as_close(wor
         assert camera.timing.min_period == pytest.approx(usual / 3)
         camera.arm(3)
         times = world.clock.now() + 1.05 * camera.timing.min_period * np.arange(1, 10)
-        world.schedule(times)
+        world.schedule(times.tolist())
         assert [camera.next_frame(1.0).time for _ in range(3)] == pytest.approx(times[2::3], abs=3e-6)
 
 
@@ -122,7 +122,7 @@ def test_level_exposes_while_the_pulse_lasts(world: World) -> None:
         assert camera.timing.min_period == pytest.approx(LINES * 7.2e-6)
         camera.arm(2)
         times = world.clock.now() + np.array([0.5, 0.6])
-        world.schedule(times)
+        world.schedule(times.tolist())
         assert [camera.next_frame(1.0).time for _ in times] == pytest.approx(times, abs=3e-6)
 
 
@@ -133,7 +133,7 @@ def test_sync_readout_has_no_dead_time_and_one_frame_less_than_pulses(world: Wor
         assert period < 0.001  # shorter than an edge trigger could have it with that exposure
         camera.arm(5)
         times = world.clock.now() + 0.1 + period * np.arange(5)
-        world.schedule(times)
+        world.schedule(times.tolist())
         assert [camera.next_frame(1.0).time for _ in range(4)] == pytest.approx(times[:4], abs=3e-6)
         with pytest.raises(DeviceTimeout):
             camera.next_frame(0.05)

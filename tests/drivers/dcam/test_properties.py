@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from drivers.base.errors import DeviceRefused
 from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.dcam.camera import DcamCamera
 from drivers.dcam.codes import Property
+from tests.drivers.dcam.fake import World
 
 EXTERNAL = CameraSettings(0.001, TriggerSource.EXTERNAL)
 
@@ -40,7 +42,7 @@ def test_exposure_is_the_value_that_the_camera_accepted(camera: DcamCamera) -> N
         ({"readout": "fast"}, r"no readout 'fast'\..* legal: standard, ultra_quiet"),
     ],
 )
-def test_a_refusal_says_why_and_leaves_the_settings(camera: DcamCamera, wrong: dict, message: str) -> None:
+def test_a_refusal_says_why_and_leaves_the_settings(camera: DcamCamera, wrong: dict[str, Any], message: str) -> None:
     before = camera.configure(CameraSettings(0.003, TriggerSource.EXTERNAL, roi=(4, 8, 20, 24), binning=2))
     timing = camera.timing
     with pytest.raises(DeviceRefused, match=message):
@@ -65,14 +67,14 @@ def test_a_refusal_says_why_and_leaves_the_settings(camera: DcamCamera, wrong: d
     ],
 )
 def test_what_another_program_left_is_undone(
-    camera: DcamCamera, world, prop: Property, left: float, needed: float
+    camera: DcamCamera, world: World, prop: Property, left: float, needed: float
 ) -> None:
     world.preset(prop, left)
     camera.configure(EXTERNAL)
     assert world.value(prop) == needed
 
 
-def test_bundled_frames_are_refused(camera: DcamCamera, world) -> None:
+def test_bundled_frames_are_refused(camera: DcamCamera, world: World) -> None:
     world.override(Property.FRAMEBUNDLE_MODE, 2)
     with pytest.raises(DeviceRefused, match=r"bundles several frames.*larger region"):
         camera.configure(EXTERNAL)
@@ -80,7 +82,7 @@ def test_bundled_frames_are_refused(camera: DcamCamera, world) -> None:
 
 @pytest.mark.parametrize("readout", orca_quest.LINE_TIME)
 @pytest.mark.parametrize("trigger", [TriggerSource.EXTERNAL, TriggerSource.SOFTWARE])
-def test_full_frame_timing_is_that_of_the_data_sheet(world, readout: str, trigger: TriggerSource) -> None:
+def test_full_frame_timing_is_that_of_the_data_sheet(world: World, readout: str, trigger: TriggerSource) -> None:
     """The fake computes times in C from the property table; the planner's figures were typed from the data sheet."""
     world.reset(*orca_quest.SENSOR_SHAPE)
     camera = world.connect()
@@ -108,7 +110,7 @@ def test_rows_of_a_binned_region_start_two_line_times_apart(camera: DcamCamera) 
         Property.INTERNAL_FRAMEINTERVAL,  # over USB it is the link's, which is slower than the sensor
     ],
 )
-def test_the_strictest_trigger_rule_sets_the_least_period(camera: DcamCamera, world, slowest: Property) -> None:
+def test_the_strictest_trigger_rule_sets_the_least_period(camera: DcamCamera, world: World, slowest: Property) -> None:
     world.override(slowest, 0.5)
     expected = 0.501 if slowest is Property.TIMING_MINTRIGGERBLANKING else 0.5
     assert camera.timing.min_period == pytest.approx(expected)

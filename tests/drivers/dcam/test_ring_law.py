@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from hypothesis import HealthCheck, given, settings
@@ -28,7 +29,9 @@ STEPS = st.lists(
 
 @given(slots=st.integers(2, 7), steps=STEPS)
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_every_exposure_is_taken_once_in_order_or_counted_as_lost(fake_library: Path, slots: int, steps: list) -> None:
+def test_every_exposure_is_taken_once_in_order_or_counted_as_lost(
+    fake_library: Path, slots: int, steps: list[Any]
+) -> None:
     world = World(fake_library)
     camera = world.connect(DcamOptions(ring=slots * FRAME_BYTES))
     camera.configure(CameraSettings(0.001, TriggerSource.EXTERNAL, roi=ROI))

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import usb.core
 
-from drivers.dcam import session as preflights
 from drivers.dcam.session import Verdict, preflight
 from tests.drivers.dcam.usb_bus import Bus, Descriptor
 
@@ -69,7 +68,7 @@ def test_without_libusb_it_cannot_tell(monkeypatch: pytest.MonkeyPatch) -> None:
     def no_backend(**_: Any) -> None:
         raise usb.core.NoBackendError("No backend available")
 
-    monkeypatch.setattr(preflights.usb.core, "find", no_backend)
+    monkeypatch.setattr("usb.core.find", no_backend)
     found = preflight()
     assert found.verdict is Verdict.UNKNOWN
     assert "libusb is not installed" in found.message

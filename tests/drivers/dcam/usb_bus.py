@@ -39,7 +39,7 @@ class Descriptor:
     port_numbers: tuple[int, ...] = (1,)
 
 
-class Bus(usb.backend.IBackend):
+class Bus(usb.backend.IBackend):  # type: ignore[misc]
     """Devices on a bus that answer string requests; `open` counts handles not yet closed."""
 
     def __init__(self, *devices: Descriptor) -> None:
@@ -63,7 +63,9 @@ class Bus(usb.backend.IBackend):
     def close_device(self, dev_handle: Descriptor) -> None:
         self.open -= 1
 
-    def ctrl_transfer(self, dev_handle, bmRequestType, bRequest, wValue, wIndex, data: array.array, timeout) -> int:
+    def ctrl_transfer(
+        self, dev_handle: Any, bmRequestType: int, bRequest: int, wValue: int, wIndex: int, data: Any, timeout: int
+    ) -> int:
         index = wValue & 0xFF
         text = ENGLISH
         if index:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from beamline.core.errors import ConfigError
 from beamline.scan.ledger import LedgerError
@@ -271,10 +272,11 @@ OF_MOTION = (
     ),
 )
 
+_FAULTS: tuple[tuple[Any, ...], ...] = (LINE, OF_LINES), (MOTION, OF_MOTION, PULSES, CAMERA)
 WORDS: Mapping[str, str] = MappingProxyType(
-    {row.fault: row.words for row in (*LINE, *OF_LINES)}
+    {row.fault: row.words for rows in _FAULTS[0] for row in rows}
     | {UNPLUGGED: PORT_FAILED}
-    | {row.fault: row.words for row in (*MOTION, *OF_MOTION, *PULSES, *CAMERA)}
+    | {row.fault: row.words for rows in _FAULTS[1] for row in rows}
 )
 """Every fault, in the order of docs/faults.md -> words that the operator sees."""
 

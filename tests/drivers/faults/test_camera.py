@@ -21,7 +21,7 @@ from tests.drivers.faults.aftermath import (
     assert_reported_once,
     assert_speaks,
 )
-from tests.drivers.faults.rig import VIEWS, Rig, Scanned
+from tests.drivers.faults.rig import DARKS, VIEWS, Rig, Scanned
 
 RigOf = Callable[..., Rig]
 ROWS = {row.fault: row for row in table.CAMERA}
@@ -183,7 +183,7 @@ def test_setting_refused(rig: Rig, when: str, tmp_path: Path) -> None:
     if when == "before the scan":
         rig.after_connecting = refuse
     else:
-        rig.at_frame[table.DARKS - 1] = refuse
+        rig.at_frame[DARKS - 1] = refuse
     scanned = rig.scan(tmp_path)
     assert_ends_as("setting refused", scanned)
     assert_speaks(scanned.error, "camera")

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.core.errors import DataError
-from beamline.core.stop import Cause, ScanAborted, ScanStopped, StopRequest
+from beamline.core.errors import DataError, ScanStopped
+from beamline.core.stop import Cause, ScanAborted, StopRequest
 from beamline.features.files.validate import validate
 from beamline.scan.control import State
 from beamline.scan.ledger import LedgerError
@@ -27,7 +27,7 @@ from tests.drivers.faults.rig import DARKS, FLATS, KINDS, VIEWS, Rig, Scanned
 RigOf = Callable[[str], Rig]
 REQUESTS = 400  # more than a scan without a fault makes
 FIRST_VIEW = DARKS + FLATS
-ENDS = {ScanAborted: State.ABORTED, ScanStopped: State.STOPPED}
+ENDS: dict[type[Exception], State] = {ScanAborted: State.ABORTED, ScanStopped: State.STOPPED}
 
 
 def scheduled(rig_of: RigOf, runs: Path, seed: int) -> State | None:

@@ -47,7 +47,7 @@ class Script:
 
 def connect(wire: Any, **settings: Any) -> SerialLine:
     of_line = {name: settings.pop(name) for name in ("timeout", "transcript") if name in settings}
-    rules = LineRules(**({"framing": GCS, "probe": Probe("ID?", "me")} | settings))
+    rules = LineRules(**({"framing": GCS, "probe": Probe("ID?", "me"), **settings}))
     usual: dict[str, Any] = {"timeout": 1.0, "baudrate": 9600, "device": "script"}
     return SerialLine(register(next(NAMES), wire), rules, wire.clock, **(usual | of_line))
 

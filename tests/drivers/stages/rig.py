@@ -37,7 +37,7 @@ class StageRig:
     def __init__(self, build: type, figures: dict[str, Any]) -> None:
         self.clock = VirtualClock()
         self.line = TriggerLine(self.clock)
-        self.controller = flat(build, **figures).controller(self.clock, self.line)
+        self.controller: Any = flat(build, **figures).controller(self.clock, self.line)
         self.url = register(next(NAMES), self)
 
     def receive(self, data: bytes) -> None:

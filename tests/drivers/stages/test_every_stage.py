@@ -37,6 +37,7 @@ def test_figures_that_no_stage_has_are_refused_before_anything_is_sent(rig_of: R
     heard: list[bytes] = []
     receive = rig.receive
     rig.receive = lambda data: (heard.append(data), receive(data))[1]  # type: ignore[method-assign]
+    value: Any
     for name, value in FIGURES:
         with pytest.raises(ValueError, match=rf"{name}|rad is not|no room|float can resolve"):
             rig.open(**{name: value})
@@ -93,7 +94,8 @@ def test_limits_in_the_controller_that_leave_no_room_are_respected(maker: str, b
     rig = RIGS[maker](**build)
     for command in said:
         rig.say(command)
-    for limits in ({}, {"low": math.radians(-8.1), "high": 1.0}):
+    too_low: dict[str, Any] = {"low": math.radians(-8.1), "high": 1.0}
+    for limits in (dict[str, Any](), too_low):
         with pytest.raises(DeviceRefused, match=re.escape("-8.0000 deg to 80.0000 deg")):
             rig.open(**limits)
     rig.open(low=math.radians(-8), high=math.radians(80)).close()

@@ -19,7 +19,6 @@ from drivers.base.clock import Clock, SystemClock
 from drivers.base.errors import DeviceError
 from drivers.stages.pi_gcs.stage import PiGcsStage
 from drivers.stages.pm16c.stage import PM16CStage
-from drivers.stages.settings import StageDriver
 from drivers.stages.zaber.stage import ZaberStage
 from drivers.testing.stages.bench import StageBench
 from simulators.devices.clock import ScaledClock
@@ -66,7 +65,7 @@ class Kind:
         farewell: parts of the last things that it sends.
     """
 
-    driver: StageDriver
+    driver: Any
     usual: Mapping[str, Any]
     wire: Callable[..., Any]
     opening: tuple[str, str]
@@ -140,7 +139,7 @@ class Real:
         self.unplug = plugged.close
         url = plugged.enter_context(serve(wire))
         timeout = PATIENCE * SPEEDS[serve] if serve is not serve_sim else PATIENCE
-        chosen = flat(kind.driver.Settings, **(kind.usual | {"timeout": timeout} | (settings or {})))
+        chosen = flat(kind.driver.Settings, **{**kind.usual, "timeout": timeout, **(settings or {})})
         self.stage = kind.driver(url, chosen, clock)
         self.bench = StageBench(self.stage, clock, line)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -72,8 +74,8 @@ def test_ssim2d_is_skimage_on_the_interior(
 
 
 def test_ssim3d_is_the_mean_over_three_directions_of_slices(rng: np.random.Generator) -> None:
-    truth = blobs(rng, (35, 14, 17)).astype(np.float32)
-    volume = (truth + rng.normal(0, 0.15, truth.shape)).astype(np.float32)
+    truth: NDArray[Any] = blobs(rng, (35, 14, 17)).astype(np.float32)
+    volume: NDArray[Any] = (truth + rng.normal(0, 0.15, truth.shape)).astype(np.float32)
     span = float(np.ptp(truth))
     directions = [
         np.mean([ssim2d(truth.take(i, axis), volume.take(i, axis), span) for i in range(truth.shape[axis])])
@@ -222,7 +224,7 @@ def test_ssim_of_whole_slices_is_the_equation_without_windows(rng: np.random.Gen
     volume = truth + rng.normal(0, 0.3, truth.shape)
     c1, c2 = 0.01**2 * np.ptp(truth) ** 2, 0.03**2 * np.ptp(truth) ** 2
 
-    def equation(x: np.ndarray, y: np.ndarray) -> float:
+    def equation(x: Any, y: Any) -> float:
         covariance = np.cov(x.ravel(), y.ravel(), ddof=0)
         means, variances = (x.mean(), y.mean()), np.diag(covariance)
         return (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -40,7 +42,7 @@ def test_angles_cannot_be_changed_from_outside() -> None:
 def test_binned_pixels_stay_before_the_sample_where_they_were(
     factor: int, axis: float, row: float, cone: bool
 ) -> None:  # fmt: skip
-    how = {"axis_row": row, "shifts": [[1.0, -2.0]]}
+    how: dict[str, Any] = {"axis_row": row, "shifts": [[1.0, -2.0]]}
     fine = (
         Geometry.cone([0.3], (11, 31), 0.3, 50.0, 70.0, axis_col=axis, **how)
         if cone else Geometry.parallel([0.3], (11, 31), pixel_pitch=0.3, axis_col=axis, **how)
@@ -54,7 +56,7 @@ def test_binned_pixels_stay_before_the_sample_where_they_were(
 
 @given(start=st.integers(0, 3), factor=st.integers(1, 3), cone=st.booleans())
 def test_cutting_and_binning_keep_the_rays_of_a_cone_and_of_leaning_views(start: int, factor: int, cone: bool) -> None:
-    lean = {"axis_row": 3.1, "shifts": [[1.0, 2.0]], "roll": 0.2, "tilt": 0.1}
+    lean: dict[str, Any] = {"axis_row": 3.1, "shifts": [[1.0, 2.0]], "roll": 0.2, "tilt": 0.1}
     whole = (
         Geometry.cone([0.3], (9, 12), 0.5, 20.0, 30.0, axis_col=4.2, **lean)
         if cone

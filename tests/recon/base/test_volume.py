@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -223,7 +224,7 @@ def test_a_grid_takes_any_list_of_whole_numbers() -> None:
         ({"shape": (0, 3, 4)}, "shape"), ({"voxel_size": 0.0}, "voxel_size"), ({"centre": (0, np.nan, 0)}, "centre"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=message):
-            Grid(**({"shape": (2, 3, 4)} | arguments))  # type: ignore[arg-type]
+            Grid(**({"shape": (2, 3, 4)} | arguments))
 
 
 def test_a_volume_fits_its_grid() -> None:
@@ -256,7 +257,8 @@ def test_the_field_holds_every_ray_and_no_more(
     shifts: list[tuple[float, float]], cone: bool,
 ) -> None:  # fmt: skip
     shifts = [(col * cols / 2, row) for col, row in shifts]  # farther aside would be wide views
-    angles, how = 0.7 * np.arange(len(shifts)), {"axis_row": axis[1], "shifts": shifts}
+    angles = 0.7 * np.arange(len(shifts))
+    how: dict[str, Any] = {"axis_row": axis[1], "shifts": shifts}
     if cone:
         views = Geometry.cone(angles, (rows, cols), 2 * pitch, 1000 * pitch, 2000 * pitch, axis_col=axis[0], **how)
     else:

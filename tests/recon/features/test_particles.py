@@ -63,7 +63,7 @@ def test_two_balls_that_touch_are_two(radius: float, apart: float) -> None:
 @pytest.mark.parametrize("seed", range(6))
 def test_an_ellipsoid_and_a_plate_are_one(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    turned = (np.stack(np.mgrid[:32, :32, :32], axis=-1) - 15.3) @ Rotation.random(rng=rng).as_matrix()
+    turned = (np.moveaxis(np.mgrid[:32, :32, :32], 0, -1) - 15.3) @ Rotation.random(rng=rng).as_matrix()
     ellipsoid = ((turned / rng.uniform(4, 12, 3)) ** 2).sum(axis=-1) <= 1
     plate = (np.abs(turned) <= (3, 8, 9)).all(axis=-1)
     assert parted(ellipsoid).max() == parted(plate).max() == 1

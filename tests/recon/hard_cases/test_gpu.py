@@ -107,7 +107,7 @@ def test_what_stands_in_a_pixel_of_no_weight_changes_no_bit(rng: np.random.Gener
     value, gradient = losses_of(image, target, weights, term)
     assert np.isfinite(value) and not gradient[weights == 0].any()
     marred = [np.where(weights > 0, a, np.float32(3e38)) for a in (image, target)]
-    again, same = losses_of(*marred, weights, term)
+    again, same = losses_of(marred[0], marred[1], weights, term)
     assert again == value
     np.testing.assert_array_equal(same, gradient)
 

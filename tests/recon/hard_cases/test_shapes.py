@@ -134,7 +134,8 @@ def test_gaussians_larger_than_the_field(on: On, sigma: float) -> None:
 @pytest.mark.parametrize("shape", [(1e-15,) * 3, (1e15,) * 3, (1e-12, 1.0, 1e8)])
 def test_a_covariance_that_is_singular_to_rounding_is_finite(on: On, shape: Place) -> None:
     # Σ₂ in float32 has no inverse here: its determinant is a difference of equal numbers, zero or negative.
-    for where in (*on.beams.values(), on.grid):
+    places: list[Geometry | Grid] = [*on.beams.values(), on.grid]
+    for where in places:
         g = on.leaves(on.some(shape, 6))
         image = on.shown(g, where)
         assert torch.isfinite(image).all() and float(image.detach().min()) >= 0

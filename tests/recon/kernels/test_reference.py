@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,13 @@ F64 = NDArray[np.float64]
 Parameters = tuple[Tensor, Tensor, Tensor, Tensor]
 
 ANGLES, SHAPE = (0.4, -2.7), (7, 8)
-SET_UP = {"axis_col": 3.1, "axis_row": 2.2, "shifts": ((0.4, -0.3), (1.2, 0.7)), "roll": (0.2, -0.1), "tilt": 0.3}
+SET_UP: dict[str, Any] = {
+    "axis_col": 3.1,
+    "axis_row": 2.2,
+    "shifts": ((0.4, -0.3), (1.2, 0.7)),
+    "roll": (0.2, -0.1),
+    "tilt": 0.3,
+}
 PARALLEL = Geometry.parallel(ANGLES, SHAPE, pixel_pitch=1.1, **SET_UP)
 CONE = Geometry.cone(ANGLES, SHAPE, 1.6, 25.0, 36.0, **SET_UP).about(((0.8, -1.5, 0.6), (-1.1, 0.4, 2.0)))
 

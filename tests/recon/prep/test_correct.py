@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -190,7 +191,7 @@ def test_stacks_of_darks_and_flats_count_by_their_means(rng: np.random.Generator
     stacks = References(references.dark + change, ((position, flat + 10 * change),))
     expected = correct(counts, positions(counts), references)
     np.testing.assert_allclose(correct(counts, positions(counts), stacks).data, expected.data, atol=1e-5)
-    camera = np.stack([np.full((2, 5), n, np.uint16) for n in (65535, 65533)])  # their sum is beyond 16 bits
+    camera: Any = np.stack([np.full((2, 5), n, np.uint16) for n in (65535, 65533)])  # their sum is beyond 16 bits
     assert (References(camera, ((0.0, camera[:1]),)).dark == 65534).all()
     assert references.rows(slice(0, 2)).dark.shape == (2, 48)
     with pytest.raises(ValueError, match=r"at 7 is"):

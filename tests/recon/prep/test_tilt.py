@@ -45,13 +45,15 @@ def test_a_tilt_is_found_within_its_uncertainty(tilt: float) -> None:
 
 def test_the_uncertainty_holds_where_views_are_few_for_the_columns() -> None:
     """32 views of 256 columns, 8 bands, little noise: some bands fit far better than others, and carry the estimate."""
-    misses, first = [], np.linspace(0, 254, 8).round().astype(np.int64)
+    misses, first = list[float](), np.linspace(0, 254, 8).round().astype(np.int64)
     for seed in range(20):
         balls = Balls(np.arange(32) * np.pi / 32, (256, 256), axis_col=131.3, seed=seed)
-        views = balls.views((first[:, None] + [0, 1]).ravel())
+        views = balls.views((first[:, None] + np.arange(2)).ravel())
         views += np.random.default_rng(seed).normal(0, 0.004, views.shape)
         with suppress(ValueError):  # where it is not to be seen
-            found = find_tilt(views.reshape(32, 8, 2, 256).mean(axis=2), first - 127.0, balls.angles)
+            found = find_tilt(
+                views.reshape(32, 8, 2, 256).mean(axis=2), (first - 127.0).astype(np.float64), balls.angles
+            )
             misses.append(found.tilt / found.uncertainty)
     assert len(misses) > 12
     assert np.max(np.abs(misses)) < 3 and np.sqrt(np.mean(np.square(misses))) < 1.3

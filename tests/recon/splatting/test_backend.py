@@ -21,8 +21,8 @@ CUT = (1e-3, 3.5)  # faint, σ
 
 
 def begin(backend: Cpu, g: Gaussians):  # type: ignore[no-untyped-def]
-    names = ("means", "log_scales", "quaternions", "raw_densities")
-    return backend.begin(*(g.arrays()[name] for name in names), UNIT)
+    of = g.arrays()
+    return backend.begin(of["means"], of["log_scales"], of["quaternions"], of["raw_densities"], UNIT)
 
 
 def geometry(shape: tuple[int, int]) -> Geometry:

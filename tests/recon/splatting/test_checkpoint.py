@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from recon.base.kernel import Kernel
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of, decisions_from, decisions_of, state_from
+from recon.splatting.problem import FitProblem
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.splat import project
 from tests.recon.conftest import Make
@@ -21,7 +23,7 @@ GRID = Grid.matching(VIEWS)
 SETTINGS = FitSettings(policy=DensityPolicy(start=0, stop=1, every=4, threshold=0.0, growth=2.0), tv_size=8)
 
 
-def _problem(random_gaussians: Make) -> fit.Problem:
+def _problem(random_gaussians: Make) -> FitProblem:
     return fit.problem_of(project(random_gaussians(30, 9.0), VIEWS).numpy(), VIEWS, GRID, 1.0, SETTINGS)
 
 
@@ -34,7 +36,8 @@ def test_a_fit_taken_up_again_is_the_fit_that_was_not_left(random_gaussians: Mak
         fit.step(parts, problem, SETTINGS, k / 16)
         if k == at:
             file = io.BytesIO()  # through a file, as numbers and nothing else
-            np.savez(file, **arrays_of(parts))
+            arrays: dict[str, Any] = {**arrays_of(parts)}
+            np.savez(file, **arrays)
             file.seek(0)
             parts = state_from(dict(np.load(file, allow_pickle=False)))
     mine, others = arrays_of(whole), arrays_of(parts)
@@ -68,7 +71,7 @@ def test_what_is_no_checkpoint_is_refused(random_gaussians: Make) -> None:
 
 
 def test_decisions_on_the_prior_are_kept() -> None:
-    made = {"candidate": [1], "units": [(3, -2, 0), (4, 4, 4)], "weight": [[0.25]], "other": [7]}
+    made: dict[str, list[Any]] = {"candidate": [1], "units": [(3, -2, 0), (4, 4, 4)], "weight": [[0.25]], "other": [7]}
     kept = decisions_from(decisions_of(made, ("candidate", "units", "weight", "strength")))
     assert kept == {"candidate": [1], "units": [[3, -2, 0]], "weight": [[0.25]]}
     assert all(isinstance(n, int) for n in kept["units"][0])  # powers of two

@@ -96,7 +96,7 @@ def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
     volumes = []
     for value in (np.nan, np.inf):
         volumes.append(finish(_of(g), g, _problem(np.where(bad, np.float32(value), data)), 2).volume.data)
-    np.testing.assert_array_equal(*volumes)
+    np.testing.assert_array_equal(volumes[0], volumes[1])
     weights = (~bad).astype(np.float32)
     weighed = finish(_of(g), g, _problem(np.where(bad, np.float32(1), data), weights), 2).volume.data
     np.testing.assert_allclose(weighed, volumes[0], atol=1e-6)

@@ -27,8 +27,8 @@ def test_mass_is_shared_among_thin_long_and_round_ones() -> None:
 
 
 def test_physical_values_come_back() -> None:
-    g = Gaussians.from_physical(np.zeros((2, 3)), [[0.1, 1, 10], [2, 2, 2]], [1e-4, 5.0], density_unit=0.5)
-    np.testing.assert_allclose(g.scales.numpy(), [[0.1, 1, 10], [2, 2, 2]], rtol=1e-6)
+    g = Gaussians.from_physical(np.zeros((2, 3)), [[0.1, 1.0, 10.0], [2.0, 2.0, 2.0]], [1e-4, 5.0], density_unit=0.5)
+    np.testing.assert_allclose(g.scales.numpy(), [[0.1, 1.0, 10.0], [2.0, 2.0, 2.0]], rtol=1e-6)
     np.testing.assert_allclose(g.densities.numpy(), [1e-4, 5.0], rtol=1e-5)
 
 

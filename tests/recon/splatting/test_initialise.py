@@ -120,7 +120,7 @@ def test_an_empty_volume_is_refused(rng: np.random.Generator) -> None:
 def test_the_density_scale_is_the_least_squares_factor(random_gaussians: Make, factor: float) -> None:
     g = random_gaussians()
     views = Geometry.parallel(np.linspace(0, 3, 7), (20, 24), pixel_pitch=0.6)
-    data = factor * project(g, views).numpy()
+    data = np.float32(factor) * project(g, views).numpy()
     np.testing.assert_allclose(scale_to_data(g, data, views).densities, factor * g.densities, rtol=1e-3)
 
 

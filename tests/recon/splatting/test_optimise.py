@@ -13,6 +13,7 @@ from recon.base.kernel import Truncation
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
+from recon.splatting.problem import FitProblem
 from recon.splatting.settings import NAMES, DensityPolicy, FitSettings
 from tests.recon.conftest import Make
 from tests.recon.helpers import as_leaves, gradients, in_double, run_steps
@@ -25,7 +26,7 @@ GRID = Grid.matching(VIEWS)
 PLAIN = FitSettings(policy=None, tv_weight=0.0, views_per_step=1, pace=3.0, decay=0.1)
 
 
-def _problem(truth: Gaussians, settings: FitSettings) -> fit.Problem:
+def _problem(truth: Gaussians, settings: FitSettings) -> FitProblem:
     return fit.problem_of(project(truth, VIEWS).numpy(), VIEWS, GRID, truth.density_unit, settings)
 
 
@@ -64,7 +65,7 @@ def test_one_step_moves_along_the_gradient_of_the_reference(random_gaussians: Ma
     scale = problem.half_field * problem.unit
     image = project(double, VIEWS.select([5]))[0] / scale
     loss = projection_loss(image, torch.from_numpy(problem.images[5]).double(), settings.ssim_weight)
-    loss = loss + settings.tv_weight * reference_tv(voxelize(double, GRID) / problem.unit)
+    loss = loss + float(settings.tv_weight or 0) * reference_tv(voxelize(double, GRID) / problem.unit)
     loss.backward()
     fit.step(state, problem, settings, 0.0, view=5)
     assert state.loss == pytest.approx(loss.item(), rel=1e-4)
@@ -114,7 +115,7 @@ def test_total_variation_sees_the_box_that_was_drawn(random_gaussians: Make) -> 
     cut = tuple(slice(c, c + 5) for c in (int(draw.integers(0, n - 5 + 1)) for n in GRID.shape))
     image = project(double, VIEWS.select([5]))[0] / (problem.half_field * problem.unit)
     expected = projection_loss(image, torch.from_numpy(problem.images[5]).double(), settings.ssim_weight)
-    expected = expected + settings.tv_weight * reference_tv(voxelize(double, GRID)[cut] / problem.unit)
+    expected = expected + float(settings.tv_weight or 0) * reference_tv(voxelize(double, GRID)[cut] / problem.unit)
     fit.step(state, problem, settings, 0.0, view=5)
     assert state.loss == pytest.approx(expected.item(), rel=1e-4)
 

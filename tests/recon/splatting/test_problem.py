@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -63,7 +65,8 @@ def test_values_that_no_matter_explains_weigh_nothing_and_spread_nowhere(
     wild, expected = (make_problem(d, VIEWS, GRID, unit, Cpu(), ssim_weight=0.25) for d in (spoilt, absent))
     image = rng.random((12, 18)).astype(np.float32)
     assert [w is None for w in wild.weights] == [True, False, True]
-    assert not wild.weights[1][at[1:]].any() and wild.weights[1].sum() == 12 * 18 - 10
+    measured = wild.weights[1]
+    assert measured is not None and not measured[at[1:]].any() and measured.sum() == 12 * 18 - 10
     for view in range(3):
         # Not only is nothing NaN: it is the very problem in which nothing was measured there.
         np.testing.assert_array_equal(wild.images[view], expected.images[view])
@@ -95,7 +98,7 @@ def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, fact
     weights[:, 0, 0] = 1  # no view is blind
     found, kept, views = join_pixels(data, weights, VIEWS, factor)
     rows, cols = 12 // factor, 18 // factor
-    assert found.shape == kept.shape == (3, rows, cols) == (3, *views.detector_shape)
+    assert kept is not None and found.shape == kept.shape == (3, rows, cols) == (3, *views.detector_shape)
     for view, row, col in np.ndindex(3, rows, cols):
         cell = np.s_[view, row * factor : (row + 1) * factor, col * factor : (col + 1) * factor]
         p, w = data[cell].astype(np.float64), weights[cell].astype(np.float64)
@@ -109,7 +112,7 @@ def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, fact
 def test_the_sample_stays_in_place_behind_binned_pixels(beam: str, factor: int) -> None:
     # 23 rows and 37 columns are a multiple of no factor, and the axis is in the middle of neither.
     width, cut = 9.0, Truncation(9.0, 1e-12)  # of the Gaussians, in pixels
-    how = {"axis_col": 15.3, "axis_row": 9.6, "shifts": [[0, 0], [1.5, -0.7], [0, 0]]}
+    how: dict[str, Any] = {"axis_col": 15.3, "axis_row": 9.6, "shifts": [[0, 0], [1.5, -0.7], [0, 0]]}
     views = (
         Geometry.parallel(VIEWS.angles, (23, 37), pixel_pitch=0.5, **how)
         if beam == "parallel" else Geometry.cone(VIEWS.angles, (23, 37), 1.0, 200.0, 400.0, **how)

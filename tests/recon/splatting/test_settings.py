@@ -23,7 +23,7 @@ def test_settings_out_of_range_are_refused() -> None:
         {"kernel": "box"},
     ):  # fmt: skip
         with pytest.raises(ValueError, match=next(iter(bad))):
-            FitSettings(**bad)  # type: ignore[arg-type]
+            FitSettings(**bad)
     for wrong in ({"sigmas": -1.0}, {"sigmas": float("nan")}, {"faint": -1.0}, {"faint": float("inf")}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Truncation(**wrong)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from recon import Geometry, Grid
 from recon.assess.metrics import psnr
@@ -60,10 +61,10 @@ def test_the_errors_along_all_views_are_the_error_of_the_volume() -> None:
     grid = Grid.matching(views)
     _, y, x = np.indices(grid.shape) - 31.5
 
-    def blob(at: float, width: float) -> np.ndarray:
+    def blob(at: float, width: float) -> NDArray[np.float32]:
         return np.exp(-((x - at) ** 2 + (y + at / 2) ** 2) / (2 * width**2)).astype(np.float32)
 
-    one, other = blob(5, 4) + blob(-9, 3), blob(5, 5) + 0.7 * blob(-9, 3)
+    one, other = blob(5, 4) + blob(-9, 3), blob(5, 5) + np.float32(0.7) * blob(-9, 3)
     projector = Projector(views, grid)
     seen = [projector.forward(volume)[:, 0] for volume in (other, one)]
     expected = np.linalg.norm(other - one) / np.linalg.norm(one)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tracemalloc
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ SHAPE = (24, 30)
 
 
 ANGLES = (0.0, 0.7, 2.5, -4.0)
-TURNED = {
+TURNED: dict[str, Any] = {
     "axis_row": 10.0,
     "shifts": ((0.4, -1.3), (1.2, 0.7), (-2.0, 0.0), (0.0, 0.5)),
     "roll": (0.2, -0.1, 0.0, 0.05),
@@ -103,7 +104,7 @@ def test_a_width_and_the_uncorrected_factor_are_refused(random_gaussians: Make) 
     ("options", "message"),
     [({"exact_above": -0.1}, "relative error"), ({"exact_above": 0.01, "rectified": False}, "rectified")],
 )
-def test_a_ray_model_that_makes_no_sense_is_refused(options: dict[str, float], message: str) -> None:
+def test_a_ray_model_that_makes_no_sense_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         RayModel(**options)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,8 +89,8 @@ def test_the_same_seed_gives_the_same_volume(data: np.ndarray, streamed: tuple[n
 
 @pytest.mark.slow
 def test_a_method_streams_with_its_own_settings(data: np.ndarray, phantom: Phantom) -> None:
-    mine = {"loss": "poisson", "kernel": Kernel.GAUSSIAN, "views_per_step": 3}
-    method = recon.R2(gaussians=800, fit=FitSettings(**mine))  # type: ignore[arg-type]
+    mine: dict[str, Any] = {"loss": "poisson", "kernel": Kernel.GAUSSIAN, "views_per_step": 3}
+    method = recon.R2(gaussians=800, fit=FitSettings(**mine))
     model = method.stream(VIEWS, 0, SteppedClock(tick=0.01))
     assert model.settings == replace(WHILE_VIEWS_COME, **mine)
     assert recon.R2().stream(VIEWS, 0, SteppedClock(tick=0.01)).settings == WHILE_VIEWS_COME
@@ -149,7 +150,7 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
     with pytest.raises(ValueError, match="nothing was changed"):
         model.add_views(bad, ANGLES[:1])
     with pytest.raises(ValueError, match="nothing was changed"):
-        model.add_views(np.full((1, *SHAPE), 1e300), ANGLES[:1])  # type: ignore[arg-type]
+        model.add_views(np.full((1, *SHAPE), 1e300), ANGLES[:1])
     assert model.n_views == 0
     with pytest.raises(ValueError, match="at least one Gaussian"):
         StreamingFit(VIEWS, GRID, gaussians=0)

@@ -43,7 +43,9 @@ def resolution_pattern(geometry: Geometry, rng: np.random.Generator) -> F32:
         part = np.clip((outer - np.abs(u - x * c - y * s)) / np.maximum(outer - inner, 1e-9), 0, 1)
         total -= part * width * length / (2 * np.maximum(a, b))
     data = total.reshape(angles.size, cols, 4).mean(2) / cols
-    return (data + rng.normal(0, 2e-3, data.shape)).astype(np.float32)[:, None].repeat(2, 1) * np.float32([[1], [0.5]])
+    return (data + rng.normal(0, 2e-3, data.shape)).astype(np.float32)[:, None].repeat(2, 1) * np.array(
+        [[1], [0.5]], np.float32
+    )
 
 
 def in_all_views(volume: F32, geometry: Geometry, grid: Grid) -> F32:
@@ -59,7 +61,7 @@ def test_ray_by_ray_is_the_plain_sum(rng: np.random.Generator) -> None:
     columns[:, 1:-1, :3] = rng.normal(size=(views, cols, 3))
     columns[:, 0], columns[:, -1] = columns[:, 1], columns[:, -2]
     angles, axis = rng.uniform(0, 7, views), rng.uniform(8, 12, views)
-    x, y = np.arange(19) - 9.0, np.arange(9) - 4.2
+    x, y = np.arange(19.0) - 9, np.arange(9.0) - 4.2
     out = np.empty((3, 9, 19), np.float32)
     ray_by_ray(angles, axis, x, y, columns, out)
     t = x * np.cos(angles)[:, None, None] + y[:, None] * np.sin(angles)[:, None, None] + axis[:, None, None]

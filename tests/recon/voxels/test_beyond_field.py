@@ -154,7 +154,7 @@ def test_wide_views_make_the_density_surer_and_have_no_part_in_fbp(wide: tuple[n
     assert alone is not None and seen is not None and seen.density < 0.8 * alone.density
     assert 0.88 < seen.radius / (1.6 * COLS / 2) < 1.05
     fbp = [recon.reconstruct(data, each, "fbp").volume.data for data, each in ((views, both), (wide[0], GEOMETRY))]
-    assert np.array_equal(*fbp)
+    assert np.array_equal(fbp[0], fbp[1])
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0), (3.5, -7.25)])

@@ -103,4 +103,4 @@ def test_a_single_slice_is_one_of_two_equal_slices(turns: int, rng: np.random.Ge
             prox.turn()
         prox(y, 0.2)
         found.append(y[:, :, 0])
-    np.testing.assert_allclose(*found, atol=1e-6)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-6)

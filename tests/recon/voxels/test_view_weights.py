@@ -175,7 +175,7 @@ def test_weights_of_the_circle_are_not_those_of_a_short_scan(span: float, n: int
 @pytest.mark.parametrize("sense", [1, -1])
 def test_both_measurements_of_a_ray_of_a_short_scan_weigh_one_together(arc: float, sense: int) -> None:
     """The ray at γ in the view β is the ray at -γ in the view β + π - 2γ, if the scan goes that far."""
-    n, cols, start = 4 * arc, 41, 2.0
+    n, cols, start = round(4 * arc), 41, 2.0
     angles = sense * (start + np.deg2rad(arc) * (np.arange(n) + 0.5) / n)
     geometry = Geometry.fan(np.random.default_rng(0).permutation(angles), cols, 1.0, 150.0, 300.0)
     weights, zeros = cone_weights(geometry)

@@ -117,7 +117,8 @@ def test_methods_take_a_skew_out(method: str) -> None:
     data = np.stack(
         [Projector(replace(views.at_row(row), skew=0.0), grid).forward(truth)[:, row] for row in range(24)], axis=1
     )
-    chosen = {"fbp": recon.Fbp(), "fista-tv": recon.FistaTv(iterations=5), "r2": recon.R2(steps=60, finish=2)}[method]
+    methods: list[recon.Method] = [recon.Fbp(), recon.FistaTv(iterations=5), recon.R2(steps=60, finish=2)]
+    (chosen,) = (each for each in methods if each.name == method)
 
     def slant(geometry: Geometry) -> float:
         volume = np.maximum(recon.reconstruct(data, geometry, chosen).volume.data, 0)[[2, 21]]
@@ -152,7 +153,7 @@ def test_the_model_of_a_fly_scan_gives_what_a_still_one_gives(method: recon.Fist
     """Balls that turn while each view is exposed, by 2.6 px at the edge of the field: within half a decibel."""
     shape, n = (8, 72), 30
     step = np.pi / n
-    angles, arc = np.arange(n) * step, 0.7 * step
+    angles, arc = np.arange(float(n)) * step, 0.7 * step
     moving = np.mean([ball_views(angles + turn, shape) for turn in ((np.arange(12) + 0.5) / 12 - 0.5) * arc], axis=0)
     views, others = (Geometry.parallel(a, shape) for a in (angles, angles + step / 2))
     unseen = ball_views(others.angles, shape)

@@ -17,7 +17,7 @@ from tests.simulators import shots
 
 @pytest.mark.parametrize("binning", [1, 2, 4])
 @pytest.mark.parametrize("readout", LINE_TIME)
-def test_a_scan_and_a_camera_with_its_roi_see_the_same(readout: Any, binning: int) -> None:
+def test_a_scan_and_a_camera_with_its_roi_see_the_same(readout: Any, binning: Any) -> None:
     scene = replace(shots.scene("photon_noise"), axis_offset_px=3.4)
     asked = replace(scene.detector, shape=(64, 96), binning=binning, readout=readout)
     # Without effects of motion its stage stands in an exposure, as its file says; an instrument's turns on.

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import pytest
 
 from simulators.effects.catalogue import CATALOGUE, Domain
-from simulators.effects.chain import Chain, Label
+from simulators.effects.chain import AnyEffect, Chain, Label
 from simulators.effects.exposure import MotionBlur
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Image, Shot
@@ -25,7 +25,7 @@ from tests.simulators.effects.parameters import PARAMETERS
 class _Wanderer:
     """Two bodies that go opposite ways by as many pixels as the stage has turned tenths of a radian."""
 
-    domain: Domain = Domain.OPTICAL_DEPTH  # type: ignore[misc]
+    domain: Domain = Domain.OPTICAL_DEPTH
 
     name: ClassVar[str] = "wanderer"
     final: ClassVar[bool] = False
@@ -40,7 +40,7 @@ class _Wanderer:
 
 def _labels(domain: Domain, turned: float, **state: bool) -> tuple[Label, ...]:
     shot = shots.shot(angle=0.0, angle_at=lambda time: turned * (time - 1000.0) / 0.01, radius=0.5, **state)
-    order = [MotionBlur(0.1, 10), _Wanderer(domain)]
+    order: list[AnyEffect] = [MotionBlur(0.1, 10), cast(AnyEffect, _Wanderer(domain))]
     return Chain.of(order).labels(shot)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import NDArray
 
 from simulators.effects.catalogue import CATALOGUE, Domain, load_effect
-from simulators.effects.chain import Chain
+from simulators.effects.chain import AnyEffect, Chain
 from simulators.frame import sensor
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector, Shot
@@ -135,13 +135,13 @@ def test_each_domain_is_seen_in_the_order_of_physics() -> None:
         final: ClassVar[bool] = False
 
         def __init__(self, domain: Domain) -> None:
-            self.name, self.domain = f"witness of {domain.name}", domain  # type: ignore[misc]
+            self.name, self.domain = f"witness of {domain.name}", domain
 
         def apply(self, image: NDArray[np.float64], shot: Shot) -> NDArray[np.float64]:
             seen[self.domain] = image
             return image + 1.0
 
-    chain = Chain.of([Witness(domain) for domain in list(Domain)[1:]])
+    chain = Chain.of([cast(AnyEffect, Witness(domain)) for domain in list(Domain)[1:]])
     frame = shots.frame(replace(shots.scene(), chain=chain))
     depth = shots.depth(shots.scene(), 0.4)
     np.testing.assert_array_equal(seen[Domain.OPTICAL_DEPTH], depth)

@@ -95,7 +95,7 @@ def test_files_outside_of_the_page_are_not_served(page: Served) -> None:
 
 def test_acting_takes_its_own_token_and_our_own_origin(run: Path) -> None:
     with served(run, control=True) as page:
-        token, ours = page.addresses.act.partition("#act=")[2], f"http://{page.host}"
+        token, ours = str(page.addresses.act).partition("#act=")[2], f"http://{page.host}"
         assert act(page, "stop") == 403
         assert act(page, "stop", X_Act_Token=token) == 403
         assert act(page, "stop", X_Act_Token=token, Origin="http://evil.example") == 403
@@ -112,7 +112,7 @@ def test_a_choice_reaches_a_scan_that_asks_and_no_other(tmp_path: Path) -> None:
     write_run(tmp_path)
     with served(tmp_path, control=True) as page:
         assert page.addresses.act is not None
-        headers = {"x_act_token": page.addresses.act.partition("act=")[2], "origin": f"http://{page.host}"}
+        headers = {"x_act_token": str(page.addresses.act).partition("act=")[2], "origin": f"http://{page.host}"}
         with asking(tmp_path) as answers:
             assert act(page, "again") == 403 and answers == []
             assert act(page, "again", **headers) == 200 and answers == ["again"]
@@ -185,7 +185,7 @@ def test_a_stop_does_not_wait_for_other_requests(tmp_path: Path, monkeypatch: py
         others = [pool.submit(page.ask, "/api/facts") for _ in range(60)]
         assert page.addresses.act is not None
         pool.submit(
-            act, page, "stop", x_act_token=page.addresses.act.partition("act=")[2], origin=f"http://{page.host}"
+            act, page, "stop", x_act_token=str(page.addresses.act).partition("act=")[2], origin=f"http://{page.host}"
         )
         deadline = time.monotonic() + 15
         while not stop.stopping and time.monotonic() < deadline:

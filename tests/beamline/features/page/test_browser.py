@@ -78,7 +78,7 @@ def test_what_can_be_measured_next_is_shown_and_chosen(browser: Browser, tmp_pat
             assert rows == [
                 "next: the next pass of the plan +0.80 (0.60 to 1.00) +0.53 90 s 12.5 % 2.00 GB recommended next",
                 "enough: no further pass +0.00 - 0 s 0.0 % 0 MB enough",
-                "1 next program +0.80 - <b>most a second",
+                "1 next program +0.80 – <b>most a second",
             ]
             find("#passes button")[1].click()
             browser.until(lambda: answers == ["enough"], "the answer reaches the scan")
@@ -87,7 +87,7 @@ def test_what_can_be_measured_next_is_shown_and_chosen(browser: Browser, tmp_pat
                 file.write(json.dumps(chosen) + "\n")
             browser.until(lambda: find("#passes button") == [], "it asks no more")
             rows = [row.text for row in find("#passes .decisions tbody tr")]
-            assert rows == ["2 enough operator +0.00 - <b>most a second", "1 next program +0.80 +0.70 <b>most a second"]
+            assert rows == ["2 enough operator +0.00 – <b>most a second", "1 next program +0.80 +0.70 <b>most a second"]
             assert browser.complaints() == []
 
 

@@ -68,7 +68,7 @@ def test_a_first_scan(browser: Browser, tmp_path: Path) -> None:
         browser.until(lambda: "This page has ended" in browser.text("said"), "the page says that it ends")
         assert browser.text("state") == "stopped"
         assert "no connection" not in browser.text("status")
-        told = browser.text("said").partition("beamline ")[2].split()
+        told = browser.text("said").partition("To see the run again: beamline ")[2].split()
         assert running.stdout is not None
         running.stdout.read()
         assert running.wait(WITHIN) == 4

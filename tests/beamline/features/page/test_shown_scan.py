@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.features.page.command import _scan
@@ -30,7 +31,10 @@ def _angles(folder: Path) -> Path:
 
 
 def _tiffs(folder: Path) -> Path:
-    images = {"dark": DARK * np.ones((1, *SCAN.shape)), "flat": (DARK + BEAM) * np.ones((1, *SCAN.shape))}
+    images: dict[str, NDArray[Any]] = {
+        "dark": DARK * np.ones((1, *SCAN.shape)),
+        "flat": (DARK + BEAM) * np.ones((1, *SCAN.shape)),
+    }
     for kind, frames in {**images, "view": SCAN.counts()}.items():
         for n, image in enumerate(frames):
             tifffile.imwrite(folder / f"{kind}_{n:03}.tif", image.astype(np.uint16))
@@ -111,7 +115,7 @@ def test_a_slice_with_a_tilt_is_that_of_views_turned_by_it(tmp_path: Path) -> No
     counts[:, 25:] = DARK + BEAM  # so that rows differ
     level = counts.copy()
     Resampling(high.shape, -math.radians(4)).apply(counts, 0)
-    row, slices, bent = 5, [], np.empty(0)
+    row, slices, bent = 5, list[NDArray[np.float32]](), np.empty((0, 0), np.float32)
     for name, views, tilt in (("level", level, 0.0), ("leaning", counts, 4.0)):
         path = write_exchange(tmp_path / f"{name}.h5", high, {"data": views.round().astype(np.uint16)})
         with closing(ShownScan(open_scan(path))) as scan:

@@ -3,9 +3,11 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.features.page import command as view_command
@@ -18,7 +20,7 @@ from tests.beamline.features.page.served import Served, viewed
 from tests.beamline.features.page.test_app import tile
 
 SHAPE = (6, 8, 10)
-RAMP = np.arange(480, dtype=np.float32).reshape(SHAPE)
+RAMP: NDArray[Any] = np.arange(480, dtype=np.float32).reshape(SHAPE)
 ALL = TileRegion(0, 99, 0, 99)
 
 
@@ -123,7 +125,7 @@ def test_grey_values_of_a_window_are_shown_as_what_they_stand_for(tmp_path: Path
     volume.close()
 
 
-FINE = np.random.default_rng(1).random((40, 304, 1500), np.float32)
+FINE: NDArray[Any] = np.random.default_rng(1).random((40, 304, 1500), np.float32)
 
 
 @pytest.fixture(scope="module")

@@ -44,7 +44,7 @@ def _rows(path: Path) -> list[dict[str, float]]:
 @pytest.mark.usefixtures("real_pictures")
 def test_particles_of_a_reconstruction_are_in_mm_in_its_frame(here: Path) -> None:
     data = can()
-    grid = Grid(data.shape, VOXEL, CENTRE)  # type: ignore[arg-type]
+    grid = Grid(data.shape, VOXEL, CENTRE)
     write_reconstruction(here / "recon.h5", replace(bare_record(here, data, (VOXEL,) * 3), volume=Volume(data, grid)))
     result = beamline("segment", "recon.h5", *MARGIN)
     assert result.exit_code == 0, result.output

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from beamline.config.load import config_folder
-from beamline.core.errors import AlarmError, ConfigError, DataError
+from beamline.core.errors import AlarmError, ConfigError, DataError, ScanStopped
 from beamline.core.events import RunStarted, StateEntered
-from beamline.core.stop import ScanStopped, StopRequest
+from beamline.core.stop import StopRequest
 from beamline.features.queue.scans import (
     QueuedScan,
     QueueError,

@@ -26,7 +26,7 @@ from recon.base.volume import Grid
 from simulators.devices.clock import VirtualClock
 from simulators.effects.catalogue import CATALOGUE
 from simulators.frame.shot import CannotExposeError
-from simulators.scenes.expose import Scan
+from simulators.scenes.expose import Scan, expose
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.simulate.read_labels import read_labels
 
@@ -110,7 +110,7 @@ def test_explain_says_what_runs_and_what_does_not(folder: Path) -> None:
 
 
 def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real, made = write.expose, []
+    real, made = expose, list[int]()
 
     def stopping(*arguments: object) -> object:
         made.append(1)
@@ -135,7 +135,7 @@ def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pyt
 def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
     folder: Path, monkeypatch: pytest.MonkeyPatch, ends: BaseException, code: int
 ) -> None:
-    real, made = write.expose, []
+    real, made = expose, list[int]()
 
     def ending(*arguments: object) -> object:
         made.append(1)

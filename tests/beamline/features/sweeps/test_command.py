@@ -46,7 +46,7 @@ def test_the_score_is_what_a_volume_leaves_of_views_that_it_has_not_seen(folder:
     geometry = Geometry.parallel(SCAN.angles, (1, 40), axis_col=20.7, pixel_pitch=0.5)
     for name in ("ram-lak", "hann"):
         views = geometry.select(used)
-        volume = direct(lines[used], views, Grid.matching(views), name)  # type: ignore[arg-type]
+        volume = direct(lines[used], views, Grid.matching(views), name)
         projector = Projector(geometry.select(held), Grid.matching(views))
         seen = at_voxel_resolution(lines[held].swapaxes(1, 2), projector.resolution).swapaxes(1, 2)
         off = projector.forward(volume) - seen

@@ -19,7 +19,7 @@ from beamline.core.errors import DataError
 from beamline.core.events import Event
 from beamline.core.machine import STATUS, peak_memory
 from beamline.features.trials import runner, tradeoff
-from beamline.features.trials.runner import ComparedScan, run_comparison, run_trial
+from beamline.features.trials.runner import ComparedScan, opened_scan, run_comparison, run_trial
 from beamline.features.trials.table import text
 from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
@@ -54,7 +54,7 @@ def _made_up(trial: Trial, work: Path | None = None, *_: object, keep: bool = Fa
     """A trial that takes no time: more work gives more quality, for more seconds and memory."""
     if keep and work is not None:
         write_array(work / VOLUME, np.zeros((4, 40, 40), np.float32))
-    amount = float((trial.settings.get("steps") or 20) * trial.views / trial.binning)
+    amount = float(int(trial.settings.get("steps") or 20) * trial.views / trial.binning)
     metrics = {"residual_held_out": 1 / amount, "psnr": math.log(amount)}
     return Outcome(trial, "done", amount / 1000, int(1e6 * amount), metrics)
 
@@ -153,7 +153,7 @@ def test_a_limit_of_time_bounds_reading_and_the_page(
         at += min(5, remaining)
         return _made_up(one) if remaining >= 5 else Outcome(one, "out of time")
 
-    opened = tradeoff.opened_scan
+    opened = opened_scan
     monkeypatch.setattr(tradeoff, "opened_scan", read)
     made_up(trial)
     table = run_tradeoff(_options(tmp_path, max_seconds=60.0), lambda e: None, lambda: at, begun=95.0)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from beamline.core.machine import STATUS, peak_memory
 from beamline.features.trials import worker as module
@@ -71,7 +72,7 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str, 
         trial = Trial("method", method, data.geometry.n_views, binning)
         found = run(trial, replace(data, prepared=given), 0)
         figures.append([*found["metrics"].values(), *found["squared_residuals"]])
-    np.testing.assert_array_equal(*figures)
+    np.testing.assert_array_equal(figures[0], figures[1])
     blind = run(trial, replace(data, prepared=replace(given, measured=None)), 0)
     assert blind["metrics"]["residual_held_out"] > 1.2 * found["metrics"]["residual_held_out"]
 
@@ -144,8 +145,10 @@ def test_data_and_job_come_through_their_folder(tmp_path: Path) -> None:
     views = Geometry.cone(
         rng.random(9), (40, 60), 0.5, 60.0, 120.0, shifts=rng.random((9, 2)), roll=0.1, tilt=rng.random(9)
     )
-    images = rng.random((9, 40, 60)).astype(np.float32)
-    whole = replace(prepared_views(images, views, weights=images / 2), sample_radius=SampleRadius(3.0, 2.0, 4.0, 0.1))
+    images: NDArray[np.float32] = rng.random((9, 40, 60)).astype(np.float32)
+    whole = replace(
+        prepared_views(images, views, weights=images / np.float32(2)), sample_radius=SampleRadius(3.0, 2.0, 4.0, 0.1)
+    )
     prepared = replace(whole.of_views(np.arange(3)), held_out=(images[3:], views.select(range(3, 9))))
     TrialData(prepared, images).save(tmp_path / "data")
     add_references(tmp_path / "data", {"os-sirt-tv": images[:1]}, np.ones((1, 2, 3), np.int8))
@@ -162,7 +165,7 @@ def test_data_and_job_come_through_their_folder(tmp_path: Path) -> None:
     for name in ("stretch", "length_unit", "n_projections", "axis_col", "sample_radius", "inside"):
         assert getattr(back.prepared, name) == getattr(prepared, name)
     assert isinstance(back.prepared.projections.data, np.memmap)  # read where it is used
-    settings = {"steps": 3, "weight": 3.0, "start": "tv"}
+    settings: dict[str, Any] = {"steps": 3, "weight": 3.0, "start": "tv"}
     job = TrialJob(Trial("method", "r2", 3, 2, settings, 1.5, ViewChoice("means", [[0, 1], [2, 3]])), 7, True)
     job.save(tmp_path)
     again = TrialJob.load(tmp_path)

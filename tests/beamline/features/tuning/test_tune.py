@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.config.load import Config, config_folder, load, plan_of
-from beamline.core.errors import InstrumentError, QualityError
-from beamline.core.stop import ScanStopped, StopRequest
+from beamline.core.errors import InstrumentError, QualityError, ScanStopped
+from beamline.core.stop import StopRequest
 from beamline.features.tuning.align import Alignment, align
 from beamline.features.tuning.tune import TARGET, evaluate, tune
 from beamline.instrument.connect import connect

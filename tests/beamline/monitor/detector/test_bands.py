@@ -67,7 +67,7 @@ def test_a_bright_band_is_one_too(fake: Any) -> None:
 
 
 def dimming(fake: Any) -> list[Frame]:
-    return fake.references() + fake.views(10) + fake.views(10, first=10, light=0.5)  # type: ignore[no-any-return]
+    return fake.references() + fake.views(10) + fake.views(10, first=10, light=0.5)
 
 
 def jumping_angles(fake: Any) -> list[Frame]:
@@ -78,14 +78,14 @@ def zingers_in_a_column(fake: Any) -> list[Frame]:
     views = fake.views(30)
     for i, view in enumerate(views[10:]):
         view.counts[[i % 64, i % 50 + 7], 30 + i] = 60000
-    return fake.references() + views  # type: ignore[no-any-return]
+    return fake.references() + views
 
 
 def an_edge_that_passes(fake: Any) -> list[Frame]:
     views = fake.views(40, discs=())
     for i, view in enumerate(views):
         view.counts[:, 90 - 2 * i :] = 200 + (view.counts[:, 90 - 2 * i :].clip(200) - 200) // 3
-    return fake.references() + views  # type: ignore[no-any-return]
+    return fake.references() + views
 
 
 @pytest.mark.parametrize("frames", [dimming, jumping_angles, zingers_in_a_column, an_edge_that_passes])

@@ -6,6 +6,7 @@ import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,7 @@ from recon.voxels.direct import Fbp
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 LENS = Distortion.parse("xcenter = 80\nycenter = 120\nfactor0 = 1.0\nfactor1 = 2e-5\n")
-PAGANIN = {"material": "100", "distance_mm": 50.0, "energy_kev": 25.0}
+PAGANIN: dict[str, Any] = {"material": "100", "distance_mm": 50.0, "energy_kev": 25.0}
 ON_VIEWS = [TiltAndLens(0.5), TiltAndLens(0.5, LENS), Phase(**PAGANIN), Phase(**PAGANIN, unsharp=(1.0, 0.5))]
 ON_ALL = {
     "sort": Rings("sort"),
@@ -92,9 +93,10 @@ def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep, shape:
     disc = 2 * np.sqrt(np.clip(0.36 - x**2, 0, None)) - 0.1 + 0.03 * x
     rng = np.random.default_rng(0)
     views = disc + rng.normal(0, 0.01, shape) + rng.normal(0, 0.02, (rows, cols))  # noise, and gains of pixels
+    unread: Any = None  # only its file is
     part = ScanPart(
-        None, Selection(), Geometry.parallel(angles, (rows, cols), pixel_pitch=1.0, axis_col=(cols - 1) / 2)
-    )  # type: ignore[arg-type]
+        unread, Selection(), Geometry.parallel(angles, (rows, cols), pixel_pitch=1.0, axis_col=(cols - 1) / 2)
+    )
 
     def work() -> None:
         data, ones = views.astype(np.float32), np.ones(n, np.float32)

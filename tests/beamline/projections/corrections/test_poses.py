@@ -113,7 +113,8 @@ def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected:
     selected |= {"axis_col": None, "cone": (9.0, 15.0) if cone else None, "pixel_size_mm": geometry.pixel_pitch}
     columns = f"view,{VECTOR_COLUMNS.format('src' if cone else 'ray')}"
     text = table(tmp_path, columns, np.arange(N), *vectors_of(geometry).T)
-    np.savez(tmp_path / "vectors.npz", **{"cone_vec" if cone else "parallel3d_vec": vectors_of(geometry)})
+    stated: dict[str, Any] = {"cone_vec" if cone else "parallel3d_vec": vectors_of(geometry)}
+    np.savez(tmp_path / "vectors.npz", **stated)
     found, of_arrays = (prepared(path, file, **selected) for file in (text, tmp_path / "vectors.npz"))
     np.testing.assert_allclose(vectors_of(found.geometry), vectors_of(of_arrays.geometry), atol=1e-12)
     pixels = round(found.geometry.pixel_pitch / geometry.pixel_pitch)

@@ -110,7 +110,7 @@ def test_rows_of_a_cone_have_no_angles_of_their_own() -> None:
 def test_rows_of_views_whose_lean_is_learnt_have_no_angles_of_their_own(term: str) -> None:
     learnt = Selection().with_steps(Calibrate((term,)))
     _, after, done = _rays(Width(), _source(), learnt)
-    assert after.width.arc > 0 and after.skew == 0 and done.parameters["readout_arc_deg"] == 0
+    assert after.width.arc > 0 and after.skew == 0 and (done.parameters or {})["readout_arc_deg"] == 0
     with pytest.raises(ConfigError, match="calibrated"):
         _rays(Width(arc="1:0.1"), _source(), learnt)
     assert _rays(Width(), _source(), Selection().with_steps(Calibrate(("axis", "shifts"))))[1].skew > 0
@@ -124,4 +124,4 @@ def test_a_followed_scan_sees_the_middle_of_the_exposure_too() -> None:
     np.testing.assert_allclose(views.angles(100.0, ids), source.angles[ids] + turned)
     geometry, done = views.geometry(100.0, ids)
     assert (geometry.width.arc, geometry.skew) == (pytest.approx(ARC), pytest.approx(SKEW))
-    assert done.parameters["exposure_arc_deg"] == pytest.approx(1.6)
+    assert (done.parameters or {})["exposure_arc_deg"] == pytest.approx(1.6)

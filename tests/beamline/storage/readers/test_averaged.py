@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +28,12 @@ DARK, FLAT, VIEW, BACK = (
 INVALID = int(FrameKind.INVALID)
 
 
-def scan(keys: list[int], degrees: list[float], dtype: Any = np.uint16) -> ArraySource:
+def scan(keys: list[int], degrees: Sequence[float], dtype: Any = np.uint16) -> Any:
     frames = np.random.default_rng(len(keys)).integers(0, 65_536, (len(keys), 3, 4)).astype(dtype)
     return ArraySource(frames, keys, np.radians(degrees))
 
 
-def means(base: ArraySource, *groups: list[int]) -> NDArray[np.float64]:
+def means(base: ArraySource, *groups: list[int] | NDArray[np.intp]) -> NDArray[np.float64]:
     return np.stack([base.read(group).astype(np.float64).mean(axis=0) for group in groups])
 
 

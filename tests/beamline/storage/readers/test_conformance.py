@@ -44,7 +44,8 @@ def _npy(path: Path) -> Path:
 
 
 def _zarr(path: Path) -> Path:
-    zarr.save_array(path, FRAMES, zarr_format=3 if path.suffix == ".zarr" else 2)
+    frames: Any = FRAMES
+    zarr.save_array(path, frames, zarr_format=3 if path.suffix == ".zarr" else 2)
     return path
 
 
@@ -77,7 +78,7 @@ SCANS: dict[str, tuple[str, Callable[[Path], Path]]] = {
 
 
 class TestReaders(ReaderConformance):
-    @pytest.fixture(params=SCANS.values(), ids=SCANS.keys())
+    @pytest.fixture(params=list(SCANS.values()), ids=list(SCANS))
     def path(self, request: pytest.FixtureRequest, tmp_path: Path) -> Path:
         name, write = request.param
         found: Path = write(tmp_path / name)

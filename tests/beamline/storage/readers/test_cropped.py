@@ -20,7 +20,7 @@ from tests.beamline.array_source import ArraySource
 from tests.beamline.storage.readers.test_conformance import FRAMES, SCANS
 
 
-@pytest.fixture(params=SCANS.values(), ids=SCANS.keys())
+@pytest.fixture(params=list(SCANS.values()), ids=list(SCANS))
 def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     name, write = request.param
     found: Path = write(tmp_path / name)
@@ -51,13 +51,10 @@ class _Flagged(ArraySource):
 
     def __init__(self) -> None:
         super().__init__(np.zeros((3, 10, 100), np.uint16), [0, 0, 0], np.zeros(3))
-
-    @property
-    def flags(self) -> FrameFlags:
         regions = np.full((3, len(TODAY), 4), -1, np.int32)
         regions[1, 0] = 2, 6, 60, 70
         bits = np.array([0, 1 << TODAY[0].bit, 0], np.uint64)
-        return FrameFlags(bits, TODAY, np.zeros((3, len(TODAY)), np.float32), regions)
+        self.flags = FrameFlags(bits, TODAY, np.zeros((3, len(TODAY)), np.float32), regions)
 
 
 @pytest.mark.parametrize(("cols", "left", "right"), [((40, 100), 19, 31), ((0, 65), 59, 65), ((0, 50), 59, 59)])

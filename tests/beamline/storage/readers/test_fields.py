@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,13 +92,13 @@ USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource
     "sample/rotation_angle": ([], lambda s: np.degrees(s.angles[-1]), 144),
     "sample/depends_on": ([("sample/depends_on", "rotation_angle", None)], lambda s: np.degrees(s.angles[-1]), 144),
     **{
-        where: ([(where, "said", None)], lambda s, name=name: s.attributes[name], "said")
+        where: ([(where, "said", None)], partial(lambda name, s: s.attributes[name], name), "said")
         for where, name in (
             ("sample/name", "sample"), ("title", "title"), ("start_time", "start_time"), ("end_time", "end_time"),
             ("instrument/name", "instrument"),
         )
     },
-    "control/data": ([("control/data", np.arange(1.0, 8), None)], lambda s: s.currents.tolist()[6], 7),
+    "control/data": ([("control/data", np.arange(1.0, 8), None)], lambda s: np.asarray(s.currents).tolist()[6], 7),
     **{
         f"{where}/incident_energy": ([(f"{where}/incident_energy", 25e3, "eV")], lambda s: s.energy_kev, 25)
         for where in ("instrument/beam", "beam", "sample/beam")
@@ -119,7 +120,7 @@ USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource
     ),
     **{
         f"detector/{way}_flipped": (
-            [(f"detector/{way}_flipped", True, None)], lambda s: s.attributes["flipped"].split(":")[0], said,
+            [(f"detector/{way}_flipped", True, None)], lambda s: str(s.attributes["flipped"]).split(":")[0], said,
         )
         for way, said in (("x", "left to right"), ("y", "upside down"))
     },

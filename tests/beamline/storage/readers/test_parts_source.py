@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -45,7 +46,7 @@ def test_it_is_the_joined_scan(tmp_path: Path, rng: np.random.Generator) -> None
             _append(writer, some, replaces=5)
     join(parts, tmp_path / "joined.h5")
     fields, flags = ("image_key", "angles", "exposures", "replaces", "part_starts"), ("bits", "scores", "regions")
-    chosen = (slice(None), rng.permutation(25), [24, 3, -1, 8], [])
+    chosen: tuple[Any, ...] = (slice(None), rng.permutation(25), [24, 3, -1, 8], [])
     with open_scan(tmp_path / "joined.h5") as joined:  # not while the parts are open in another mode
         expected = {name: getattr(joined, name) for name in (*fields, "plan", "checksummed")}
         flagged, pixels = joined.flags, [joined.read(rows, slice(1, 3)) for rows in chosen]

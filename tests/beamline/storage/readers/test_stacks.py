@@ -14,7 +14,7 @@ from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.stored_order import axis_vertical
 
-PATHS = {
+PATHS: dict[str, Any] = {
     "data_path": "/raw/images",
     "darks_path": "/raw/before/dark",
     "flats_path": "/raw/before/flat",
@@ -126,7 +126,7 @@ def _stored(path: Path, images: np.ndarray, order: tuple[int, ...], matlab: bool
 
 
 def _options(path: Path, dimensions: str = "") -> SourceOptions:
-    names = {"darks_path": "dark", "flats_path": "flat", "angles_path": "omega", "angles_unit": "deg"}
+    names: dict[str, Any] = {"darks_path": "dark", "flats_path": "flat", "angles_path": "omega", "angles_unit": "deg"}
     return SourceOptions(path, data_path=f"/images{dimensions}", **names)
 
 
@@ -171,7 +171,7 @@ def test_the_advice_for_exchanged_rows_and_columns_gives_no_mirror_image(tmp_pat
             group[name] = part.transpose(0, 2, 1)
         group["theta"] = angles
         group["theta"].attrs["units"] = "deg"
-    given = {"darks_path": "dark", "flats_path": "flat", "angles_path": "theta", "data_path": "proj"}
+    given: dict[str, Any] = {"darks_path": "dark", "flats_path": "flat", "angles_path": "theta", "data_path": "proj"}
     with open_scan(SourceOptions(tmp_path / "s.h5", **(given if store == "stacks" else {}))) as source:
         (finding,) = axis_vertical(source)
     options = dict(re.findall(r"--(\w+)-path ([\w/,:]+\w)", finding.message))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ SCAN = TwoCylinders()
     seed=st.integers(0, 99),
     sign=st.sampled_from([np.int16, ">i2"]),
 )
-def test_counts_that_wrapped_are_told_at_any_level_of_light(beam: float, noise: float, seed: int, sign: object) -> None:
+def test_counts_that_wrapped_are_told_at_any_level_of_light(beam: float, noise: float, seed: int, sign: Any) -> None:
     rng = np.random.default_rng(seed)
     views = beam * np.exp(-SCAN.line_integrals()[:6]) + noise * rng.standard_normal((6, *SCAN.shape))
     counts = views.clip(0, 65535).astype(np.uint16)

@@ -34,7 +34,8 @@ def scan(balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], a
         depth += 2 * mu * np.sqrt((radius**2 - (col - at) ** 2 - (row[:, None] + y / 8) ** 2).clip(0))
     beam = LIGHT * np.exp(-0.3 * np.linspace(-1, 1, COLS) ** 2)
     light = np.zeros((4, ROWS, COLS)), np.tile(beam, (4, ROWS, 1)), beam * np.exp(-depth)
-    return scan_of(*(rng.poisson(each + DARK) for each in light), np.radians(stated))
+    darks, flats, views = (rng.poisson(each + DARK) for each in light)
+    return scan_of(darks, flats, views, np.radians(stated))
 
 
 def told(source: ArraySource) -> list[Finding]:

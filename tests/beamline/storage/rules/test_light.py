@@ -31,7 +31,8 @@ def counts(radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def told(darks: np.ndarray, flats: np.ndarray, views: np.ndarray, exposures: np.ndarray | None = None) -> str:
     """All sentences of a scan, or of its refusal."""
-    source = scan_of(*(np.clip(np.round(each), 0, 65535) for each in (darks, flats, views)), ANGLES)
+    darks, flats, views = (np.clip(np.round(each), 0, 65535) for each in (darks, flats, views))
+    source = scan_of(darks, flats, views, ANGLES)
     if exposures is not None:
         source.exposures = exposures
     try:

@@ -22,7 +22,7 @@ from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
 
 SHAPE = 3, 4, 5
-VALUES = (np.arange(60, dtype=np.float32).reshape(SHAPE) - 7) / 8
+VALUES = ((np.arange(60.0).reshape(SHAPE) - 7) / 8).astype(np.float32)
 RECORD = ReconRecord(
     volume=Volume(VALUES, Grid(SHAPE, 0.25, (0.5, 0.0, -1.0), slice_pitch=0.375)),
     length_unit="mm",

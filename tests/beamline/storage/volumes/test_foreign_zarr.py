@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.page.volume import ScaledSlices, TileRegion, slices_of
+from beamline.page.tiles import TileRegion
+from beamline.page.volume import ScaledSlices, slices_of
 from beamline.storage.foreign_zarr import ZarrScale, open_zarr
 from beamline.storage.volume_file import read_volume
 from beamline.storage.volumes.files import opened_volume

@@ -40,14 +40,14 @@ def test_paths_types_and_units_of_nxtomo(path: Path, frames: list[Frame]) -> Non
         assert angle.attrs["units"] == "degree"
         np.testing.assert_allclose(angle[5:], np.linspace(0, 180, 9))
         assert np.isnan(angle[:5]).all()
-        for path, value, unit in (
+        for name, value, unit in (
             ("instrument/detector/x_pixel_size", 0.0046, "mm"),
             ("instrument/detector/y_pixel_size", 0.0046, "mm"),
             ("instrument/detector/distance", 100.0, "mm"),
             ("instrument/beam/incident_energy", 25.0, "keV"),
             ("record/axis_col", 7.25, "pixel"),
         ):
-            assert (entry[path][()], entry[path].attrs["units"]) == (value, unit)
+            assert (entry[name][()], entry[name].attrs["units"]) == (value, unit)
         classes = {name: item.attrs["NX_class"] for name, item in entry.items() if isinstance(item, h5py.Group)}
         assert classes["instrument"] == "NXinstrument"
         assert classes["sample"] == "NXsample"

@@ -23,7 +23,7 @@ from beamline.storage import disk_file
 from beamline.storage.readers.open import open_scan
 from beamline.storage.writers import layout, nxtomo
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from beamline.storage.writers.rows import Rows
+from beamline.storage.writers.rows import Rows, put_exchange_view
 from drivers.base.frame import Frame
 from tests.beamline.storage.conftest import INFO, SHAPE, append
 from tests.clock import SteppedClock
@@ -127,7 +127,7 @@ def test_what_close_changes_after_the_last_frame_is_nothing_that_frames_hang_on(
     before, changed = [b""], tmp_path / "s.h5"
     writer = NXtomoWriter(changed, INFO, SHAPE, clock=clock)
     append(writer, *frames)
-    view_of = nxtomo.put_exchange_view
+    view_of = put_exchange_view
 
     def look_first(path: Path) -> None:
         with h5py.File(path) as file:  # closed, in order, for any program

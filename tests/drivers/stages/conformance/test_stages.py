@@ -115,6 +115,6 @@ class TestStages(StageConformance):
         return request.param
 
     @pytest.fixture
-    def build(self, kind: Kind) -> Iterator[Build]:  # type: ignore[override]
+    def build(self, kind: Kind) -> Iterator[Build]:
         with ExitStack() as plugged:
             yield kind.build(plugged)

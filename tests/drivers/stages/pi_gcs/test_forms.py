@@ -109,7 +109,11 @@ def test_a_window_begins_before_and_ends_half_a_step_behind_its_train(train: Tri
     behind = sign * (window.stop - train.end)
     assert behind == window.step / 2
     before = sign * (train.start - window.start)
-    shares = {PiFirstPulse.AT_THRESHOLD: 0, PiFirstPulse.STEP_AFTER: 1, PiFirstPulse.GRID: Fraction(1, 2)}
+    shares: dict[PiFirstPulse, Fraction | int] = {
+        PiFirstPulse.AT_THRESHOLD: 0,
+        PiFirstPulse.STEP_AFTER: 1,
+        PiFirstPulse.GRID: Fraction(1, 2),
+    }
     assert before == shares[rule] * window.step
     assert window.start != window.stop
 

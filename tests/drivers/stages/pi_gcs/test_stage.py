@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 
@@ -48,7 +49,7 @@ def test_errors_of_the_past_and_half_a_line_left_over_do_not_matter(rig: Rig) ->
         ({"first_pulse": "some time"}, "some time"),
     ],
 )
-def test_settings_that_do_not_fit_are_refused_with_a_remedy(rig: Rig, settings: dict[str, object], says: str) -> None:
+def test_settings_that_do_not_fit_are_refused_with_a_remedy(rig: Rig, settings: dict[str, Any], says: str) -> None:
     with pytest.raises((DeviceRefused, ValueError), match=says):
         rig.open(**settings)
     rig.open().close()

@@ -136,7 +136,7 @@ def test_a_stop_that_crosses_the_way_back_to_the_switch_stops_it(rig: Rig) -> No
             listen(b"SSTPB\r\n")
         listen(data)
 
-    rig.controller.receive = stop_before_going_home  # type: ignore[method-assign]
+    rig.controller.receive = stop_before_going_home
     with pytest.raises(DeviceError, match="stopped short"):
         stage.wait(LONG)
     assert not stage.moving()

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -102,17 +103,20 @@ def test_a_script_gets_the_volumes_that_the_command_writes(series: Path, scan: P
     held = api.reconstruct(scan, method, selection=wanted, say=None)
     assert held.output is None and held.report is None and not held.parameters["moves"] and held.units == "1/mm"
     assert held.seconds_of_volumes == pytest.approx((0, SPAN)) and held.axis_col == 19.5
+    assert held.series is not None
     with h5py.File(series) as file:
         np.testing.assert_array_equal(held.series.data, file["entry/data/data"][()])
         assert held.metrics["residual"] == file["entry/reconstruction/metrics/residual"][()] > 0
     kept = api.reconstruct(scan, method, selection=wanted, output=tmp_path / "kept.h5", say=None)
     assert left(tmp_path) == {"kept.h5", "kept.html"} and kept.report == tmp_path / "kept.html"
+    assert kept.series is not None
     np.testing.assert_array_equal(kept.series.data, held.series.data)
     np.testing.assert_array_equal(kept.volume.data, held.series.data[0])
     assert not kept.ended_early
     with pytest.raises(api.DataError, match="12 views"):
         api.reconstruct(scan, replace(method, volumes=4), selection=wanted, say=None)
-    for output, more in (("other.tif", {}), ("other.h5", {"rows": (0, 1), "views": "fixed:12"})):
+    part: dict[str, Any] = {"rows": (0, 1), "views": "fixed:12"}
+    for output, more in (("other.tif", dict[str, Any]()), ("other.h5", part)):
         with pytest.raises((api.ConfigError, api.DataError)):
             api.reconstruct(scan, method, output=tmp_path / output, say=None, **more)
     assert left(tmp_path) == {"kept.h5", "kept.html"}
@@ -189,7 +193,7 @@ def test_a_stop_during_the_fit_writes_the_volumes_so_far(
 
     sweeps = energy_fit.EnergyFit.sweeps
 
-    def interrupted(fit: energy_fit.EnergyFit, weights: np.ndarray, n: int):  # type: ignore[no-untyped-def,type-arg]
+    def interrupted(fit: energy_fit.EnergyFit, weights: np.ndarray, n: int):  # type: ignore[no-untyped-def]
         for number, residual in enumerate(sweeps(fit, weights, n)):
             every = fit.views.geometry.n_views == 36  # the fit itself, after go_on has heard of its first sweep
             if every and (n, number) == (30, 1):

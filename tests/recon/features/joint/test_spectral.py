@@ -8,12 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+import recon
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.features.joint.energy_fit import EnergyFit, EnergyViews
 from recon.features.joint.spectral import TRIAL_SWEEPS, fit_materials
-from recon.methods import by_name
 from recon.reconstruction import reconstruct
 from recon.voxels.projector import Projector
 
@@ -92,7 +92,7 @@ def test_few_views_an_energy_tell_the_share_of_a_material_better_than_one_volume
         return rms((np.clip(found, 0, 1) - share)[matter])
 
     def separately(weight: float) -> F32:
-        method = by_name("fista-tv")(tv_weight=weight)
+        method = recon.FistaTv(tv_weight=weight)
         volumes = []
         for energy in range(len(EDGE)):
             own = views.energy == energy

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 import recon
 from recon.assess.metrics import psnr
@@ -45,7 +46,7 @@ def test_a_clone_is_two_equal_gaussians_of_half_the_density(random_gaussians: Ma
 
 def test_a_split_draws_two_narrower_ones_from_the_gaussian(random_gaussians: Make) -> None:
     g = random_gaussians(1)
-    many = g.select(np.zeros(4000, np.int64))
+    many = g.select(torch.zeros(4000, dtype=torch.int64))
     change = _change(many, large=1e-6)
     np.testing.assert_allclose(np.exp(change.log_scales), np.tile(g.scales.numpy() / 1.6, (8000, 1)), rtol=1e-5)
     np.testing.assert_allclose(_densities(change), float(g.densities[0]) / g.density_unit / 2, rtol=1e-5)

@@ -36,8 +36,8 @@ def _four(*arrays: np.ndarray) -> list[list[np.ndarray]]:
 def test_no_gradient_at_all_moves_nothing() -> None:
     # 0 / (0 + eps): eps keeps it from being 0 / 0.
     value, zero = np.ones((3, 2), np.float32), np.zeros((3, 2), np.float32)
-    values, *rest = _four(value, zero, zero, zero)
-    adam_all(values, *rest, (0.1,) * 4, 1)
+    values, gradients, first, second = _four(value, zero, zero, zero)
+    adam_all(values, gradients, first, second, (0.1,) * 4, 1)
     np.testing.assert_array_equal(values, [value] * 4)
 
 
@@ -45,9 +45,12 @@ def test_what_would_be_updated_as_a_copy_is_refused() -> None:
     whole = np.zeros((4, 6), np.float32)
     for bad in (whole[:, ::2], whole[:, :2]):
         with pytest.raises(ValueError, match="C-contiguous"):
-            adam_all(*_four(bad, *(np.zeros(bad.shape, np.float32) for _ in range(3))), (0.1,) * 4, 1)
+            zeros = np.zeros(bad.shape, np.float32)
+            values, gradients, first, second = _four(bad, zeros, zeros, zeros)
+            adam_all(values, gradients, first, second, (0.1,) * 4, 1)
     with pytest.raises(ValueError, match="of one shape"):
-        adam_all(*_four(whole, *(np.zeros((6, 4), np.float32) for _ in range(3))), (0.1,) * 4, 1)
+        values, gradients, first, second = _four(whole, *[np.zeros((6, 4), np.float32)] * 3)
+        adam_all(values, gradients, first, second, (0.1,) * 4, 1)
 
 
 def test_lengths_add_up(rng: np.random.Generator) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, TypeAlias
+
 import numpy as np
 import pytest
 import torch
@@ -22,10 +24,11 @@ from recon.kernels.cpu.footprints import (
     footprints_backward,
 )
 
-F64 = NDArray[np.float64]
+F32: TypeAlias = NDArray[np.float32]
+F64: TypeAlias = NDArray[np.float64]
 
 SHAPE = (20, 26)
-TURNED = {"axis_row": 8.0, "shifts": ((0.4, -1.3), (1.2, 0.7)), "roll": (0.2, -0.1), "tilt": -0.3}
+TURNED: dict[str, Any] = {"axis_row": 8.0, "shifts": ((0.4, -1.3), (1.2, 0.7)), "roll": (0.2, -0.1), "tilt": -0.3}
 ANGLES = (0.4, -2.7)
 GEOMETRIES = {
     "straight": Geometry.parallel(ANGLES, SHAPE, pixel_pitch=0.5, axis_col=11.3, shifts=((0.4, -1.3), (1.2, 0.7))),
@@ -48,17 +51,18 @@ def raw(rng: np.random.Generator, n: int = 30, extent: float = 10.0) -> tuple[Te
 
 
 def active_of(parameters: tuple[Tensor, ...]) -> Active:
-    return Active.of(*(p.numpy() for p in parameters), UNIT)
+    means, scales, quaternions, raw_densities = (p.numpy() for p in parameters)
+    return Active.of(means, scales, quaternions, raw_densities, UNIT)
 
 
-def table_of(active: Active, geometry: Geometry, view: int, *, faint: float = 1e-12, **options: float) -> F64:
+def table_of(active: Active, geometry: Geometry, view: int, *, faint: float = 1e-12, **options: Any) -> F32:
     table = footprint_table(len(active.densities))
     parameters = (active.means, active.scales, active.rotations, active.densities)
     footprints(*parameters, camera(geometry, view), faint, 9.0, table, **options)
     return table
 
 
-def on_pixels(table: F64) -> tuple[F64, F64, F64]:
+def on_pixels(table: F32 | F64) -> tuple[F64, F64, F64]:
     """G [n, row, col] of each footprint and the offsets (τ, δv) [n, row, col] from its centre, in float64."""
     t = table.astype(np.float64)[:, :, None, None]
     rows, cols = np.mgrid[: SHAPE[0], : SHAPE[1]]

@@ -140,7 +140,9 @@ def test_ssim_equals_scikit_image_in_the_interior(rng: np.random.Generator) -> N
     _, full = structural_similarity(
         *padded, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, full=True
     )
-    assert ssim(*(torch.from_numpy(a) for a in padded)).item() == pytest.approx(float(full.mean()), abs=1e-6)
+    assert ssim(torch.from_numpy(padded[0]), torch.from_numpy(padded[1])).item() == pytest.approx(
+        float(full.mean()), abs=1e-6
+    )
 
 
 @pytest.mark.parametrize("shape", [(5, 6, 7), (1, 4, 4), (1, 1, 3), (1, 1, 1)])

@@ -54,7 +54,7 @@ def _smooth(table: NDArray[np.float32], i: int, shape: tuple[int, int]) -> bool:
 
 
 def _one(long: float, short: float, turn: float, centre: tuple[float, float] = (31.3, 30.6)) -> NDArray[np.float32]:
-    return _table(np.array([centre]), *(np.array([x]) for x in (long, short, turn, 1.0)))
+    return _table(np.array([centre]), np.array([long]), np.array([short]), np.array([turn]), np.ones(1))
 
 
 @pytest.mark.parametrize("kernel", Kernel)
@@ -128,8 +128,8 @@ def test_any_footprint_is_finite_and_its_moment_is_the_adjoint(rows: list[tuple[
 def test_any_footprint_is_right_within_its_reach(
     long: float, short: float, turn: float, x: float, y: float, kernel: Kernel
 ) -> None:
-    one = (np.array([value]) for value in (long, short, turn, 1.0))
-    table = _table(np.array([[x, y]]), *one, kernel.reach(3.5))
+    place = np.array([[x, y]])
+    table = _table(place, np.array([long]), np.array([short]), np.array([turn]), np.ones(1), kernel.reach(3.5))
     value = _dense(table, (33, 47), kernel)[0][0]
     outside = 0.0 if kernel.is_compact else np.exp(-0.5 * 3.5**2)
     assert (

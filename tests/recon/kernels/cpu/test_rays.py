@@ -68,7 +68,8 @@ def test_a_ray_sees_a_gaussian_up_to_the_cut_and_not_beyond(seed: int, cut: floa
     # The rays within `cut` standard deviations: the kernel lacks only what the reference has beyond them, and adds
     # nothing beyond, except for Gaussians that reach the source's plane, whose rays fill no ellipse.
     parameters = raw(np.random.default_rng(seed), 1, 9.0, largest)
-    active = Active.of(*parameters, UNIT)
+    means, scales, quaternions, raw_densities = parameters
+    active = Active.of(means, scales, quaternions, raw_densities, UNIT)
     image = np.zeros(SHAPE, np.float32)
     rays_of(active, WIDE, cut=cut).add_to(image)
     whole = exact_view(as_leaves(parameters), WIDE).detach().numpy()
@@ -125,7 +126,7 @@ def test_long_thin_ones_keep_their_digits(aspect: float, rng: np.random.Generato
     turn = rng.normal(size=(n, 4)).astype(np.float32)
     means = ((rng.random((n, 3)) - 0.5) * 6).astype(np.float32)
     parameters = (means, np.log(scales).astype(np.float32), turn, np.zeros(n, np.float32))
-    rays, image = rays_of(Active.of(*parameters, UNIT), WIDE), np.zeros(SHAPE, np.float32)
+    rays, image = rays_of(Active.of(*parameters[:4], UNIT), WIDE), np.zeros(SHAPE, np.float32)
     rays.add_to(image)
     expected = exact_view(as_leaves(parameters), WIDE).detach().numpy()
     # A thousandth of a needle's width is what its centre's place in float32 leaves.

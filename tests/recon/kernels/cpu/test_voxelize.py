@@ -34,7 +34,9 @@ def test_only_gaussians_that_meet_the_box_are_placed(rng: np.random.Generator) -
     # Those that lie between two slices are met by none.
     assert set(layout.hits) <= set(expected) and np.all(np.diff(layout.hits) > 0)
     assert len(layout.hits) > 0
-    brute = Layout(tuple(a[expected] for a in model), origin, 2.0, shape, 1e-6, 3.5)
+    brute = Layout(
+        (model[0][expected], model[1][expected], model[2][expected], model[3][expected]), origin, 2.0, shape, 1e-6, 3.5
+    )
     np.testing.assert_array_equal(layout.fill(), brute.fill())
 
 
@@ -43,7 +45,7 @@ def test_nothing_to_place_is_an_empty_volume() -> None:
     far = tuple(np.full(s, 1e6, np.float32) for s in ((2, 3), (2, 3), (2, 9), (2,)))
     faint = tuple(np.ones(s, np.float32) for s in ((2, 3), (2, 3), (2, 9), (2,)))
     for model, limit in ((nothing, 0.0), (far, 1e9), (faint, 2.0)):
-        layout = Layout(model, (0.0, 0.0, 0.0), 1.0, (3, 4, 5), limit, 3.5)
+        layout = Layout((model[0], model[1], model[2], model[3]), (0.0, 0.0, 0.0), 1.0, (3, 4, 5), limit, 3.5)
         assert layout.hits.size == 0 and not layout.fill().any()
         into = [np.zeros_like(a) for a in (model[0], model[1], model[2], model[3])]
         layout.backward(np.ones((3, 4, 5), np.float32), *into)

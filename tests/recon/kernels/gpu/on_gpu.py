@@ -34,7 +34,7 @@ def _prepare_the_language_once() -> None:
         return prepare(function) if fresh else interpreter._LangPatchScope()
 
     if hasattr(interpreter, "_LangPatchScope"):
-        interpreter._patch_lang = once
+        interpreter._patch_lang = once  # type: ignore[attr-defined]
 
 
 _prepare_the_language_once()

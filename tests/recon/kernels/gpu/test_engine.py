@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,9 @@ from tests.recon.kernels.gpu.on_gpu import UNIT, cone, parallel
 gpu = importlib.import_module("recon.kernels.gpu")
 
 
-def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: FitSettings) -> tuple[fit.FitState, list]:
+def _fit(
+    backend: Backend[Any], g: Gaussians, geometry: Geometry, settings: FitSettings
+) -> tuple[fit.FitState, list[Any]]:
     """Three steps with a round of density control on data and weights that are always the same."""
     rng = np.random.default_rng(5)
     data = rng.random((geometry.n_views, *geometry.detector_shape)).astype(np.float32)
@@ -44,7 +47,7 @@ def _fit(backend: Backend, g: Gaussians, geometry: Geometry, settings: FitSettin
     ],
 )
 def test_a_fit_is_the_same_on_both_backends(
-    make: object, kernel: Kernel, changes: dict, random_gaussians: Make
+    make: object, kernel: Kernel, changes: dict[str, Any], random_gaussians: Make
 ) -> None:
     g, geometry = random_gaussians(14, 6.0, kernel=kernel), make((11, 14))  # type: ignore[operator]
     # The CPU's sixteen lanes reach past a box's end; without truncation only rounding is left.

@@ -31,7 +31,7 @@ def test_projection_loss_and_gradient_equal_the_reference(
     w = None if weights is None else backend.array(weights)
     value, gradient = loss(x, y, loss.target_maps(y, w), w)
     exact, *others = (None if a is None else torch.from_numpy(a.astype(np.float64)) for a in (image, target, weights))
-    assert exact is not None
+    assert exact is not None and others[0] is not None
     exact.requires_grad_()
     expected = projection_loss(exact, others[0], 0.25, others[1], term)
     expected.backward()

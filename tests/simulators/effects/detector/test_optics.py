@@ -156,8 +156,8 @@ def test_a_flat_divides_it_out() -> None:
     effect = {"kind": "flat_structure", "specks": 15_000, "radius_um": 60.0, "scratches": 200, "seed": 3}
     scene = shots.scene(effect)
     flat = shots.frame(scene, sample=False)
-    np.testing.assert_allclose(flat * CONVERSION / 4000, FlatStructure(15_000, 60.0, scratches=200, seed=3)
-                               .transmission(shots.shot()), atol=2e-5)  # fmt: skip
+    expected = FlatStructure(15_000, 60.0, scratches=200, seed=3).transmission(shots.shot())
+    np.testing.assert_allclose(flat * CONVERSION / 4000, expected, atol=2e-5)
     assert flat.std() / flat.mean() > 0.02
     np.testing.assert_allclose(shots.frame(scene) / flat, np.exp(-shots.depth(scene, 0.4)), rtol=3e-3)
 

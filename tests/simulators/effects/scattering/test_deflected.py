@@ -85,7 +85,7 @@ def test_the_region_holds_all_it_changes_in_every_view() -> None:
 def test_each_keeps_its_number_from_view_to_view() -> None:
     (effect,) = shots.scene(ONE | {"count": 3, "distance": [0.5, 0.6]}).chain.effects
     assert isinstance(effect, Floaters)
-    places = {which: [] for which in range(3)}
+    places: dict[int, list[Any]] = {which: [] for which in range(3)}
     for view in range(VIEWS):
         shown = list(effect.crumbs(_view(view)))
         assert [label.which for label in effect.labels(_view(view))] == [crumb.which for crumb in shown]

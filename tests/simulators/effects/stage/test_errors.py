@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -99,8 +100,12 @@ class TrapezoidStage:
 def test_backwards_the_sample_stands_further_than_the_stage() -> None:
     scene = shots.scene({"kind": "backlash", "lost_motion_deg": 0.5})
     lagging = shots.frame(shots.scene(), shots.shot(angle=0.4 + math.radians(0.5)))
+
+    def turned(speed: float, time: NDArray[np.float64] | float) -> Any:
+        return 0.4 + speed * (time - 1000.0)
+
     for speed, expected in ((0.2, shots.frame(shots.scene())), (-0.2, lagging)):
-        seen = shots.frame(scene, angle_at=lambda time, speed=speed: 0.4 + speed * (time - 1000.0))
+        seen = shots.frame(scene, angle_at=partial(turned, speed))
         np.testing.assert_array_equal(seen, expected)
 
 

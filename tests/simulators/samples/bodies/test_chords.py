@@ -114,7 +114,7 @@ def test_attenuations_add_up_and_may_be_negative() -> None:
 
 
 def test_solids_partly_or_wholly_outside_the_frame() -> None:
-    far = [Ellipsoid((0.1, 0.1, 0.1), 1.0, (5.0, 0.0, 0.0)), Box((0.1, 0.1, 0.1), 1.0, (0.0, 0.0, -5.0))]
+    far: list[Solid] = [Ellipsoid((0.1, 0.1, 0.1), 1.0, (5.0, 0.0, 0.0)), Box((0.1, 0.1, 0.1), 1.0, (0.0, 0.0, -5.0))]
     assert not Phantom.of(far).line_integrals(0.0, Detector.centred((8, 8), 0.02)).any()
     assert not Phantom.of(far).line_integrals(0.0, Detector.centred((8, 8), 0.02, sod=7.0)).any()
     wide = Phantom.of([Cylinder(3.0, 9.0, 1.0)])

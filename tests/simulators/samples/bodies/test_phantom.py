@@ -128,7 +128,7 @@ def test_names_that_do_not_fit_are_refused() -> None:
 
 
 def test_solids_outside_the_grid() -> None:
-    far = [Ellipsoid((0.1, 0.1, 0.1), 1.0, (5.0, 0.0, 0.0)), Box((0.1, 0.1, 0.1), 1.0, (0.0, 0.0, -5.0))]
+    far: list[Solid] = [Ellipsoid((0.1, 0.1, 0.1), 1.0, (5.0, 0.0, 0.0)), Box((0.1, 0.1, 0.1), 1.0, (0.0, 0.0, -5.0))]
     assert not Phantom.of(far).attenuation(Grid((8, 8, 8), 0.02)).any()
     assert not Phantom.of(far).labels(Grid((8, 8, 8), 0.02)).any()
     wide = Phantom.of([Cylinder(3.0, 9.0, 1.0)])

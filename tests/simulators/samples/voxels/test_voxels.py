@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -197,6 +198,6 @@ def test_threads_change_nothing(random: Voxels, monkeypatch: pytest.MonkeyPatch)
         ({"thresholds": [1.0, 2.0], "names": ("one",)}, "as many names"),
     ],
 )
-def test_wrong_volumes_are_refused(wrong: dict, message: str) -> None:
+def test_wrong_volumes_are_refused(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Voxels.of(**({"attenuation": np.zeros((2, 2, 2)), "spacing": 0.1} | wrong))
+        Voxels.of(**{"attenuation": np.zeros((2, 2, 2)), "spacing": 0.1, **wrong})

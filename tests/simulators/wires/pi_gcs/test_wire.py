@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.testing.stages.bench import emitted
+from drivers.testing.stages.bench import EmittedPulse, emitted
 from simulators.devices.clock import VirtualClock
-from simulators.devices.trigger_line import Pulse, TriggerLine
+from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.wire import PiGcsBuild
 from tests.drivers.stages.flat_settings import flat
 
@@ -64,7 +64,7 @@ class Wire:
         self.clock.sleep(3600.0)
         assert self.ask("ERR?") in ("0", "10")
 
-    def pulses(self) -> list[Pulse]:
+    def pulses(self) -> list[EmittedPulse]:
         return emitted(self.line, self.clock)
 
     def degrees(self) -> list[float]:

@@ -42,7 +42,7 @@ def _volume() -> np.ndarray:
     """vol_gt [x, y, z] on voxels as fine as ours, which are of a pixel at the axis."""
     side = (np.arange(N) - (N - 1) / 2) * PITCH * DSO / DSD
     x, y, z = np.meshgrid(side, side, side, indexing="ij")
-    return sum(m * ((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2 <= r**2) for a, b, c, r, m in BALLS)  # type: ignore[no-any-return]
+    return sum(m * ((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2 <= r**2) for a, b, c, r, m in BALLS)
 
 
 def _scene(folder: Path, **changed: Any) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ def written(path: Path, images: NDArray[np.generic]) -> Path:
 
 @pytest.mark.parametrize("quantity", IMAGES)
 @pytest.mark.parametrize("kind", [np.float32, np.float64, np.float16])
-def test_reals_are_read_as_such(tmp_path: Path, quantity: str, kind: type) -> None:
+def test_reals_are_read_as_such(tmp_path: Path, quantity: Any, kind: Any) -> None:
     images = IMAGES[quantity].astype(kind)
     known = kind is not np.float16 or quantity != "counts"  # which halves may be whole numbers, too
     with open_scan(SourceOptions(written(tmp_path / "s.tif", images), quantity=quantity)) as source:

@@ -92,7 +92,7 @@ def test_line_integrals_are_those_of_the_scan(tmp_path: Path) -> None:
 
 
 def test_a_cone_states_its_pixel_at_the_sample(tmp_path: Path) -> None:
-    cone = {"ImageInfo__XrayGeometry": np.int32(1), "ImageInfo__StoRADistance": np.float32(-20)}
+    cone: dict[str, Any] = {"ImageInfo__XrayGeometry": np.int32(1), "ImageInfo__StoRADistance": np.float32(-20)}
     cone["ImageInfo__DtoRADistance"] = np.float32(60)
     with open_scan(write_compound(tmp_path / "s.txrm", streams(**cone))) as source:
         assert source.cone == (20.0, 80.0)
@@ -103,8 +103,10 @@ def test_a_cone_states_its_pixel_at_the_sample(tmp_path: Path) -> None:
 
 
 def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
-    none = ("ReferenceData__Image", "ReferenceData__DataType", "ImageInfo__PixelSize", "ImageInfo__ExpTimes")
-    path = write_compound(tmp_path / "s.txrm", streams(**dict.fromkeys(none), ImageInfo__ImagesTaken=np.uint32(30)))
+    none: dict[str, Any] = dict.fromkeys(
+        ("ReferenceData__Image", "ReferenceData__DataType", "ImageInfo__PixelSize", "ImageInfo__ExpTimes")
+    )
+    path = write_compound(tmp_path / "s.txrm", streams(**none, ImageInfo__ImagesTaken=np.uint32(30)))
     with open_scan(path) as source:
         assert (source.quantity, source.pixel_size_mm) == ("unknown", None)
         assert source.image_key.tolist() == [FrameKind.PROJECTION] * 30
@@ -148,7 +150,7 @@ def test_shifts_that_bring_views_back_are_poses_unless_they_are_ignored(tmp_path
     np.testing.assert_allclose(displaced.geometry.shifts, np.stack([-back, 0 * back], axis=1))
     assert "120 poses" in said[0] and "4 px (columns)" in said[0]
     with open_scan(SourceOptions(path, flats=VIEWS[:1])) as source:
-        np.testing.assert_allclose(source.shifts, [[np.nan] * 2] * 3 + [[-each, 0] for each in back])
+        np.testing.assert_allclose(np.asarray(source.shifts), [[np.nan] * 2] * 3 + [[-each, 0] for each in back])
     ignored, said = prepare(path, selection.with_steps(PosesOfFile(read_poses("ignore"))))
     assert not ignored.geometry.shifts.any() and said == []
     with pytest.raises(ConfigError, match="--tilt and --poses both"):

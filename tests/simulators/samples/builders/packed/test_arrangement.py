@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import get_args
@@ -62,7 +63,7 @@ def overlapping(solids: list[Solid], grown: float = 1.0) -> list[tuple[int, int]
     return [(i, j) for i, j in combinations(range(len(solids)), 2) if near[i, j] and not apart(solids[i], solids[j])]
 
 
-def _placed(solids: list[Solid], centres: np.ndarray) -> list[Solid]:
+def _placed(solids: Sequence[Solid], centres: np.ndarray) -> list[Solid]:
     return [replace(solid, centre=tuple(centre)) for solid, centre in zip(solids, centres.tolist(), strict=True)]
 
 

@@ -12,15 +12,17 @@ from recon.base.volume import Grid
 from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
 from simulators.light import Beam
+from simulators.samples.bodies.solids import Ellipsoid
 from simulators.samples.builders.packed.foam import Foam, holes
 from simulators.samples.composed import build_sample
 
-SETTINGS = {"n_holes": 400, "candidates": 20_000, "gap_um": 2.0}
+SETTINGS: dict[str, Any] = {"n_holes": 400, "candidates": 20_000, "gap_um": 2.0}
 
 
 def _balls(foam: Foam) -> np.ndarray:
     """(x, y, z, radius) of the holes."""
-    return np.array([(*p.solid.centre, p.solid.semi_axes[0]) for p in foam.pieces() if p.role == "hole"])
+    holes = [piece.solid for piece in foam.pieces() if piece.role == "hole"]
+    return np.array([(*hole.centre, hole.semi_axes[0]) for hole in holes if isinstance(hole, Ellipsoid)])
 
 
 @pytest.mark.parametrize("edges", [None, (0.3, 0.4, 0.5)])
@@ -41,7 +43,7 @@ def test_each_hole_is_the_largest_that_fits_at_any_candidate(rng: np.random.Gene
     """Against the reference implementation: every candidate is checked for every hole."""
     points, room = rng.uniform(-0.5, 0.5, (2000, 3)), rng.uniform(0.02, 0.1, 2000)
     found = holes(points, room, 0.01, 0.003, 300)
-    left, expected = room.copy(), []
+    left, expected = room.copy(), list[Any]()
     while len(expected) < 300 and left.max() >= 0.01:
         i = int(left.argmax())
         expected.append((*points[i], left[i]))
