@@ -177,17 +177,18 @@ class PreparedProjections:
 
     @property
     def views(self) -> Views:
-        """The views used."""
-        return Views(self.projections.data, self.geometry, self.ray_factors())
+        """The views used, with weights that are computed where they are read."""
+        weights: Any = self.ray_factors()
+        return Views(self.projections.data, self.geometry, weights)
 
     @property
     def views_held_out(self) -> Views | None:
-        """The views held out; None where all are used."""
+        """The views held out, likewise; None where all are used."""
         if self.held_out is None:
             return None
         data, geometry = self.held_out
         weights, n = self.ray_factors(geometry.n_views), self.geometry.n_views
-        later = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
+        later: Any = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
         return Views(data, geometry, later)
 
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:

@@ -22,6 +22,7 @@ from recon.base.decisions import Decisions
 from recon.base.empirical import FEWEST_SUBSETS, ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, RunControl
+from recon.base.view_data import split_views as split_views
 from recon.base.volume import Grid
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, subsets_of
@@ -82,13 +83,6 @@ def cheapest_not_led(residuals: Sequence[F64 | None], least_gain: float = LEAST_
         return None
     best = min(tried.values(), key=lambda each: float(each.mean()))
     return next(at for at, each in tried.items() if not leads(best, each, least_gain))
-
-
-def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Views to reconstruct from, and one in so many held out, evenly spread in angle."""
-    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
-    unseen = np.sort(order[one_in // 2 :: one_in])
-    return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen
 
 
 def choice_sweeps(geometry: Geometry) -> float:

@@ -45,7 +45,7 @@ def warnings_of(made: Reconstruction, prepared: PreparedProjections, selection: 
     """Those of a volume without a report."""
     facts = ScanFacts(Path("scan.h5"), "scan.h5", "", {}, "")
     context, target = ReportContext(facts, selection, "", 0), OutputPaths(Path("out.h5"), None)
-    return check_volume(made, prepared, None, target, context, lambda event: None, SystemClock()).warnings
+    return list(check_volume(made, prepared, None, target, context, lambda event: None, SystemClock()).warnings)
 
 
 def odd(said: list[str]) -> str:
