@@ -74,9 +74,9 @@ def write_result(
     Raises:
         DataError: the volume could not be written; none is left. A report that fails is a warning.
     """
-    phases = context.phases
+    phases, ordinary = context.phases, prepared.ordinary
     phases.enter("measuring the volume")
-    checked = check_volume(made, prepared.ordinary, truth, target, context, sink, clock)
+    checked = check_volume(made, ordinary, truth, target, context, sink, clock)
     remarks = [*checked.warnings, *([checked.skipped_text] if checked.skipped_text else [])]
     context = replace(context, warnings=remarks)
     record, volumes = _record(made, checked, prepared, target, context, clock.now())
@@ -87,7 +87,7 @@ def write_result(
     if target.report is not None:
         phases.enter("report")
         try:
-            state_time = _report(made, prepared.ordinary, truth, checked, volumes, target, record.parameters, context)
+            state_time = _report(made, ordinary, truth, checked, volumes, target, record.parameters, context)
         except Exception as error:  # the volume stands, whatever its page lacks
             said = f"There is no report: {type(error).__name__}: {error}. The volume is whole."
             sink(Warned(said, time=clock.now()))
