@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+from recon.base import forks as forks  # first, as a fork may come soon
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.method import DataUse, Progress, Reconstruction, RunControl

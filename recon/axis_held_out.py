@@ -48,7 +48,7 @@ def axis_by_views(
         projections: float32 [view, row, col], line integrals; `VIEWS` x `COLS` are enough.
         geometry: of these views; the search begins at its `axis_col`.
         progress: takes the number of candidates tried so far.
-        lit: [row, col], pixels that the beam reaches; None: all. Others count as not measured.
+        lit: [row, col] or [view, row, col], pixels that measured something; None: all.
 
     Returns:
         Not confident where the best candidate leaves nearly as much as the others.
@@ -61,8 +61,10 @@ def axis_by_views(
     if geometry.n_views < _LEAST_VIEWS:
         raise ValueError(f"{geometry.n_views} views are too few for held-out views; at least {_LEAST_VIEWS} are needed")
     warn_of_other_quantity(projections)
-    data = projections if lit is None else np.where(lit, projections, 0).astype(np.float32)
-    width, longer = _WIDER if wider_than_field(data, geometry) else 1.0, 1 if lit is None else _SHADOWED
+    data, known = projections, projections
+    if lit is not None:
+        data, known = (np.where(lit, projections, np.float32(other)) for other in (0, np.nan))
+    width, longer = _WIDER if wider_than_field(known, geometry) else 1.0, 1 if lit is None else _SHADOWED
     tried = list[float]()
 
     def ask(column: float) -> None:
@@ -120,9 +122,9 @@ class _Residuals:
         if (height := size[1] * binning) < rows:
             first = round(min(max(geometry.axis_row - height / 2, 0), rows - height))
             data, geometry = data[:, first : first + height], geometry.rows(first, first + height)
-            lit = None if lit is None else lit[first : first + height]
+            lit = None if lit is None else lit[..., first : first + height, :]
         if lit is not None:
-            lit = bin_views(lit[None].astype(np.float32), binning) > _WHOLE
+            lit = bin_views(np.broadcast_to(lit, data.shape).astype(np.float32), binning) > _WHOLE
         binned = bin_views(np.ascontiguousarray(data), binning)
         return cls(binned, geometry.binned(binning), lit, binning, axis_col, sweeps, width, ask)
 
@@ -135,9 +137,10 @@ class _Residuals:
 
     def __call__(self, axis_col: float) -> float:
         if axis_col not in self.found:
-            views, lit = self._moved(axis_col), 1 if self.lit is None else self.lit
+            views = self._moved(axis_col)
             grid, method = self.grid or self.grid_about(axis_col), FistaTv(self.sweeps, _TV_WEIGHT)
             unseen, images = predicted_views(method, self.data, views, grid, self.lit, _ONE_IN)
+            lit = 1 if self.lit is None else self.lit[unseen]
             measured = self.data[unseen] * lit
             matter = _norm(measured)
             if matter == 0:

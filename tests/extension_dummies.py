@@ -192,6 +192,7 @@ READER = Extension(
         "beamline/storage/readers/npy_stack.py": """
 import numpy as np
 
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from drivers.base.frame import FrameKind
 
@@ -203,8 +204,7 @@ class NpyStack(ScanSource):
         self.path, self._data = path, np.load(path, allow_pickle=False)
         n, *shape = self._data.shape
         self.shape, self.dtype, self.facts = tuple(shape), self._data.dtype, {}
-        self.image_key = np.full(n, FrameKind.PROJECTION, np.int32)
-        self.angles = self.exposures = np.full(n, np.nan)
+        self.table = FrameTable.of(np.full(n, FrameKind.PROJECTION))
 
     def read(self, frames, rows=WHOLE):
         return self._data[frame_indices(frames, len(self._data)), rows]

@@ -22,7 +22,6 @@ from beamline.core.events import Done, Sink
 from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
 from drivers.base.clock import SystemClock
-from drivers.base.frame import FrameKind
 from recon.base.registry import in_folders
 
 if TYPE_CHECKING:
@@ -330,8 +329,8 @@ def _treated(path: Path) -> str:
     from beamline.storage.rules.treatment import treatment_of
 
     with suppress(DataError), open_scan(path) as source:
-        views = source.image_key == FrameKind.PROJECTION
-        return "" if source.flags is None else treatment_of(source.flags, views, source.shape).in_words
+        views = source.table.are_views
+        return "" if source.table.flags is None else treatment_of(source.table.flags, views, source.shape).in_words
     return ""
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 from pydantic import ValidationError
@@ -32,7 +32,17 @@ _TOO_MUCH = (
 )
 _QUOTED = re.compile(r"""(?m)"(?:\\.|[^"\\])*"|'[^']*'|(?:^|(?<=\s))#.*$""")  # and remarks
 _BRACKETS = re.compile(rf"(?:[\[{{]\s*){{{_DEEPEST}}}")  # one after the other: of a thousand, PyYAML takes a second
+_TAGGED = "text that begins with ! or = needs quotes"
 _NO_SPACE = re.compile(r"[\s-]*[\w.]+:[^\s:/\\]")
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values; a date is text, as in the name of a sample."""
+
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, form) for tag, form in forms if not tag.endswith(":timestamp")]
+        for first, forms in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -69,7 +79,7 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
     """The values in a YAML text, and the place of each."""
     origins: dict[KeyPath, str] = {}
     with yaml_faults(text, name):
-        node = yaml.compose(text, yaml.SafeLoader)
+        node = yaml.compose(text, _Loader)
         if node is None:
             return None, origins
         _locate(node, (), name, origins)
@@ -100,8 +110,11 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
     """The line of a fault of YAML, 0: not known, and what is wrong with it, for who does not know YAML."""
     mark, context = getattr(error, "problem_mark", None), getattr(error, "context_mark", None)
     problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
+    if isinstance(error, yaml.reader.ReaderError):
+        at = error.position
+        return text.count("\n", 0, at) + 1, f"the character U+{ord(text[at]):04X} belongs to no text; take it out"
     if mark is None:
-        return 0, problem
+        return 0, problem if isinstance(error, yaml.YAMLError) else _TAGGED
     lines = [*text.split("\n"), ""]
     this, above = lines[mark.line], next((each for each in lines[: mark.line][::-1] if each.strip()), "")
     opened = text[context.index : context.index + 1] if context else ""
@@ -123,6 +136,9 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
         ("cannot start any token" in problem, f"a value begins with {this[mark.column :][:1]!r}; put it into quotes"),
         ("escape" in problem, "in double quotes, a backslash begins a special character; use single quotes"),
         (opened in ("*", "&") or "alias" in problem, "text that begins with * or & needs quotes"),
+        (this[mark.column :][:1] in ("!", "=") or "tag" in problem, _TAGGED),
+        ("unhashable" in problem, "a key of this line is a list or a group; keys are text"),
+        ("another document" in problem, "a second document begins here; settings are one"),
         (of_key and _NO_SPACE.match(this), "a space is missing after the colon of this line"),
         (of_key and _NO_SPACE.match(above), "a space is missing after the colon of the line above"),
         (of_key and ": " in this[: mark.column], "a colon is missing, or a value that has a colon needs quotes"),

@@ -55,7 +55,8 @@ class Kept:
 class Fit:
     """The fit of a view to another: its shift across and down, with the standard deviation `sigma` by noise, and the
     remainder as a shift; all in pixels. `places`: sum of squares of the shares that the places of single views have in
-    the shift.
+    the shift. `off`: by which, as a shift of all, the kept view may miss the other although nothing moved, beyond the
+    limit of a change.
     """
 
     across: float
@@ -63,6 +64,7 @@ class Fit:
     remainder: float
     sigma: float
     places: float = 2.0
+    off: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,63 +125,67 @@ class OppositeCheck(Logged):
         self, state: OppositeState, at: int, view: CellView, context: ScanContext
     ) -> Look[OppositeState] | None:
         """The view against one that was kept; None where they are neither opposite nor at one angle, or where the step
-        that gives its velocity is too far: then the pair waits for views that are nearer."""
+        that gives its velocity is far and only a larger motion would show: the pair waits for views that are nearer."""
         one, grid = state.kept[at], context.grid
         assert one.after is not None and grid is not None
         turn, step = _folded(view.angle - one.view.angle), one.after.angle - one.view.angle
         beside, other = min(BESIDE * abs(step), REACH / (0.5 * grid.shape[1])), math.copysign(math.pi, turn)
-        if (
-            not one.turned
-            and abs(turn - other) <= beside
-            and self._predicts(one, one.after, (turn - other) / step, grid)
-        ):
-            kept = (*state.kept[:at], replace(one, turned=True), *state.kept[at + 1 :])
-            return self._mirrored(replace(state, kept=kept), one, (turn - other) / step, view, context)
-        if not one.again and abs(turn) <= beside and self._predicts(one, one.after, turn / step, grid):
-            kept = (*state.kept[:at], replace(one, again=True), *state.kept[at + 1 :])
-            fit = lay_on(one, turn / step, view, grid, mirrored=False)
-            again = f"frame {one.view.index}, taken again"
-            return Look(
-                replace(state, kept=kept), None if fit is None else self._moved(fit, view.index, again, context)
-            )
-        return None
+        mirrored = not one.turned and abs(turn - other) <= beside
+        if not mirrored and (one.again or abs(turn) > beside):
+            return None
+        steps = (turn - other if mirrored else turn) / step
+        off = self._off(one, one.after, steps, grid)
+        fit = lay_on(one, steps, view, grid, mirrored=mirrored) if math.isfinite(off) else None
+        if fit is None:
+            return None
+        fit = replace(fit, off=off)
+        looked = (
+            self._mirrored(state, one, fit, view, context)
+            if mirrored
+            else Look(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", context))
+        )
+        if off and looked.flag is None:
+            return None
+        one = replace(one, turned=one.turned or mirrored, again=one.again or not mirrored)
+        return replace(looked, state=replace(looked.state, kept=(*state.kept[:at], one, *state.kept[at + 1 :])))
 
-    def _predicts(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> bool:
-        """Whether a kept view with its velocity predicts one some steps later, to within the limit of a change.
+    def _off(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
+        """Pixels, as a shift of all, by which a kept view with its velocity may miss one some steps later; see
+        `Fit.off`.
 
         A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
         differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that
-        is smoothed so is at most √1.5 / SMOOTH of the first one. Where the sample moved between them, by more than the
-        rim turns, there is no velocity.
+        is smoothed so is at most √1.5 / SMOOTH of the first one. Where they differ by more, or the sample moved between
+        them, by more than the rim turns, there is no velocity: infinite.
         """
+        if min(abs(steps), abs(steps - 1)) < BESIDE - 1:
+            return 0.0
         fit, smooth = lay_on(one, 0.0, after, grid, mirrored=False), SMOOTH * grid.cell
-        errors = math.sqrt(1.5) * abs(steps * (steps - 1)) / 2 / smooth  # of the line, over the square of the step's
         rim = 0.5 * grid.shape[1] * grid.cell * abs(_folded(after.angle - one.view.angle))
-        return min(abs(steps), abs(steps - 1)) < BESIDE - 1 or (
-            fit is not None
-            and max(abs(fit.down), abs(fit.across) - rim) <= max(self.warn, CELLS[0] * grid.cell, SIGMAS * fit.sigma)
-            and fit.remainder <= smooth
-            and errors * fit.remainder**2 <= max(self.changed, CELLS[1] * grid.cell)
-        )
+        if (
+            fit is None
+            or fit.remainder > smooth
+            or max(abs(fit.down), abs(fit.across) - rim) > max(self.warn, CELLS[0] * grid.cell, SIGMAS * fit.sigma)
+        ):
+            return math.inf
+        off = math.sqrt(1.5) * abs(steps * (steps - 1)) / 2 / smooth * fit.remainder**2
+        return off * (off > max(self.changed, CELLS[1] * grid.cell))
 
     def _mirrored(
-        self, state: OppositeState, one: Kept, steps: float, view: CellView, context: ScanContext
+        self, state: OppositeState, one: Kept, fit: Fit, view: CellView, context: ScanContext
     ) -> Look[OppositeState]:
         assert context.grid is not None
-        fit = lay_on(one, steps, view, context.grid, mirrored=True)
-        if fit is None:
-            return Look(state)
         cell, cols = context.grid.cell, context.grid.shape[1]
         axis = (cols * cell - 1 + fit.across) / 2
         first = state.axis is None
         usual = axis if state.axis is None else state.axis
         moved = replace(fit, across=2 * (axis - usual))
         flag = self._moved(moved, view.index, f"frame {one.view.index}, from the other side", context)
-        state = replace(state, axis=usual)
+        state = state if fit.off else replace(state, axis=usual)
         stated = context.axis_col
         shaken = SHAKEN * math.sqrt(fit.places) * context.shake[0] / 2
         limit = max(self.axis, CELLS[2] * cell, shaken)
-        if flag is not None or not first or stated is None or abs(axis - stated) <= limit:
+        if fit.off or flag is not None or not first or stated is None or abs(axis - stated) <= limit:
             return Look(state, flag)
         advice = (
             f"By frames {one.view.index} and {view.index}, from opposite sides, the axis is at column "
@@ -192,7 +198,8 @@ class OppositeCheck(Logged):
         moved, cell = math.hypot(fit.across, fit.down), context.grid.cell
         # The first pair, which gave the axis, had views beside the sample's way, too.
         shaken = SHAKEN * math.sqrt(2 * fit.places) * math.hypot(*context.shake)
-        limits = max(self.warn, CELLS[0] * cell, SIGMAS * fit.sigma, shaken), max(self.changed, CELLS[1] * cell)
+        moves = self.warn, CELLS[0] * cell, SIGMAS * fit.sigma, shaken
+        limits = max(fit.off, *moves), max(fit.off, self.changed, CELLS[1] * cell)
         if moved <= limits[0] and fit.remainder <= limits[1]:
             return None
         score, limit = (moved, limits[0]) if moved > limits[0] else (fit.remainder, limits[1])

@@ -15,8 +15,8 @@ from beamline.core.errors import DataError
 from beamline.page.tiles import MOST, TileRegion, bin_mean, lit
 from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import read_flags, read_legend
+from beamline.storage.recorded_frames import frames_in
 from beamline.storage.writers import layout
-from drivers.base.frame import FrameKind
 
 
 @dataclass(frozen=True)
@@ -147,8 +147,7 @@ class Recording:
         Returns:
             [view, col / bin] of at most 1024 columns, the frames, and the binning.
         """
-        kinds = np.array(self._column(layout.KIND, 0, self.progress().frames), int)
-        views = np.flatnonzero(kinds == FrameKind.PROJECTION)
+        views = frames_in(self._file, self.progress().frames).views
         views = views[views >= first]
         packed = self._data.id.get_create_plist().get_nfilters() > 0  # each row would cost reading a whole frame
         source, bin_of_source = (self._preview, self.preview_bin) if packed else (self._data, 1)
@@ -179,8 +178,8 @@ class Recording:
     def _references(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
         """Means of the first darks and flats, at most eight each; None until there are some of both."""
         if self._dark_and_flat is None:
-            kinds = np.array(self._column(layout.KIND, 0, frames), int)
-            darks, flats = (np.flatnonzero(kinds == kind)[:8] for kind in (FrameKind.DARK, FrameKind.FLAT))
+            table = frames_in(self._file, frames)
+            darks, flats = table.darks[:8], table.flats[:8]
             if darks.size == 0 or flats.size == 0:
                 return None
             dark = self._mean(darks)

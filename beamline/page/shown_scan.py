@@ -44,7 +44,7 @@ class _OverFlats:
     dtype = np.dtype(np.float32)
 
     def __init__(self, source: ScanSource) -> None:
-        self.source, self.frames = source, np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+        self.source, self.frames = source, source.table.views
         if not self.frames.size:
             raise DataError(f"{source.path} has no projections to show: `beamline info` says what its frames are.")
         self.shape = self.frames.size, *source.shape
@@ -67,7 +67,7 @@ class _OverFlats:
         return views
 
     def _mean(self, kind: FrameKind) -> F32 | None:
-        rows = spread(np.flatnonzero(self.source.image_key == kind), _REFERENCES)
+        rows = spread(self.source.table.of_kind(kind), _REFERENCES)
         return read_known(self.source, rows).mean(axis=0, dtype=np.float32) if rows.size else None
 
 
@@ -83,7 +83,7 @@ class ShownScan:
 
     def __init__(self, source: ScanSource) -> None:
         self._source, self._views = source, _OverFlats(source)
-        self._degrees = np.degrees(source.angles[self._views.frames])
+        self._degrees = np.degrees(source.table.angles[self._views.frames])
         record = bare_record(source.path, self._views)
         self.stack = ShownVolume(source.path, record=replace(record, parameters={"angles_deg": self._degrees}))
         self._correction: ScanCorrection | None = None
@@ -129,7 +129,7 @@ class ShownScan:
             axis, said = self._source.axis_col, "as the file states"
         elif not is_cone:
             with suppress(ValueError):
-                found = find_axis(self._lines, self._source.angles[self._ids])
+                found = find_axis(self._lines, self._source.table.angles[self._ids])
                 axis, said = found.value, f"found by row {row}{'' if found.confident else ', not a clear optimum'}"
         return {"axis": round(axis, 2), "said": said, "leans": not is_cone}
 
@@ -143,7 +143,7 @@ class ShownScan:
 
         self._read(row, tilt_deg)
         every = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
-        data, angles = self._lines[::every], self._source.angles[self._ids[::every]]
+        data, angles = self._lines[::every], self._source.table.angles[self._ids[::every]]
         geometry = geometry_of(self._source, Selection(rows=(self._band.start, self._band.stop)), axis_col, angles)
         whole = Grid.matching(geometry)
         cols, voxel, height = self._source.shape[1], whole.voxel_size, 0.0
@@ -198,7 +198,10 @@ class ShownScan:
         frames = self._views.frames[np.isfinite(self._degrees)]
         if not frames.size:
             raise DataError(f"{self._source.path} states no angles, which a slice needs: give --angles FILE.")
-        some, band = spread_views(self._source.angles[frames], _VIEWS, frames), range(max(near, 0), min(far + 1, rows))
+        some, band = (
+            spread_views(self._source.table.angles[frames], _VIEWS, frames),
+            range(max(near, 0), min(far + 1, rows)),
+        )
         try:
             self._correction = self._correction or ScanCorrection(self._source, Selection(), lambda _: None)
             corrected = self._correction.at_once(some, slice(band.start, band.stop))

@@ -30,6 +30,7 @@ _AXIS_ROWS = 64
 _COMPARED, _FEWEST = 90, 20  # views that are enough for an axis that is given; fewer may be sure and wrong
 _CONFIRMED = 0.5  # columns, of binned views, up to which those held out confirm an axis
 _CANDIDATES = 14  # of the axis of a cone, usually
+_GUESSED = 0.01  # of the mass, in pixels that were filled, from which they draw the axis away
 
 
 def rotation_axis(
@@ -96,11 +97,11 @@ def _axis_by_views(
         frames = frames[poses.stated(frames)]
     views = ScanCorrection(source, coarse, lambda _: None).at_once(spread(frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
-    geometry = geometry_of(source, coarse, begin, source.angles[views.view_ids])
+    geometry = geometry_of(source, coarse, begin, source.table.angles[views.view_ids])
     if poses is not None:
         geometry = poses.corrected(geometry, views.view_ids)
     try:
-        estimate = axis_by_views(views.data, geometry, lambda n: progress(n, max(n, _CANDIDATES)))
+        estimate = axis_by_views(views.data, geometry, lambda n: progress(n, max(n, _CANDIDATES)), lit=views.lit)
     except ValueError as error:
         if stated is None:
             raise _not_found(source, error) from error
@@ -163,11 +164,11 @@ def locate_axis(
     """
     height = (correction.rows.stop - correction.rows.start) // correction.binning
     start = max(0, (height - _AXIS_ROWS) // 2)
-    frames = spread_views(source.angles[frames], _AXIS_VIEWS, frames)
+    frames = spread_views(source.table.angles[frames], _AXIS_VIEWS, frames)
     band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
     hidden = band.masked.all(axis=0)  # columns behind slits, which were filled: their noise has a long lever
     lit = np.flatnonzero(~hidden | hidden.all())
-    angles = source.angles[band.view_ids]
+    angles = source.table.angles[band.view_ids]
     try:
         estimate = find_axis(np.ascontiguousarray(band.data[..., lit[0] : lit[-1] + 1]), angles)
         estimate = replace(estimate, value=estimate.value + lit[0], candidates=estimate.candidates + lit[0])
@@ -175,7 +176,8 @@ def locate_axis(
             estimate = find_axis(band.data, angles)
     except ValueError as error:
         raise _not_found(source, error) from error
-    if all_there and not estimate.confident and source.axis_col is None and estimate.method != ENDS:
+    unsure = not estimate.confident and source.axis_col is None and estimate.method != ENDS
+    if all_there and (unsure or _hides_matter(band)):
         estimate = _by_unseen_views(band, angles) or estimate
     axis_col = unbinned(estimate.value, correction.binning)
     if estimate.confident:
@@ -190,6 +192,13 @@ def locate_axis(
     return source.axis_col, estimate
 
 
+def _hides_matter(band: Projections) -> bool:
+    """Whether parts of rows that measured nothing in a view were filled with matter, whose place is a guess."""
+    if not band.unmeasured.size or (lit := band.lit) is None:
+        return False
+    return bool(band.data[~lit & lit.any(axis=2, keepdims=True)].sum() > _GUESSED * band.data.sum())
+
+
 def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEstimate | None:
     """The axis of a sample wider than the field, or of a detector in part without beam; None: not found so either.
 
@@ -197,11 +206,11 @@ def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEsti
     """
     if band.data.shape[1] < band.data.shape[2] // COLS:
         return None  # columns would stay fine, and volumes take minutes
-    dark, some = areas(band.masked), spread(np.arange(angles.size), VIEWS)
+    dark, some, lit = areas(band.masked), spread(np.arange(angles.size), VIEWS), band.lit
     data = np.ascontiguousarray(band.data[some])
     with suppress(ValueError):
         estimate = axis_by_views(
-            data, Geometry.parallel(angles[some], data.shape[1:]), lit=~dark if dark.any() else None
+            data, Geometry.parallel(angles[some], data.shape[1:]), lit=None if lit is None else lit[some]
         )  # fmt: skip
         if estimate.confident or dark.any():
             return replace(estimate, confident=not dark.any())

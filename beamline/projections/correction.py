@@ -67,10 +67,11 @@ class ScanCorrection:
         if self._filters.filters:
             selection = selection.with_steps(replace(selection.step(Preparation), noise="log", gain=None))
         self._source, self._selection, self._warn = source, selection, warn
-        if source.altered:
+        if source.table.altered.any():
             warn(altered_sentence(source))
         self._beam: OpenBeam | None = None
         self._shadow: tuple[Mask, Mask] | None = None  # as of `OpenBeam.shadow`; None: not looked for
+        self._fed_by: tuple[Mask, Mask] | None = None  # the shadow by which `feed` corrects
         if source.quantity == "counts":
             self._beam = OpenBeam.of(source, selection, self._filters.read(None), self.rows, warn)
         elif selection.step(Preparation).noise == "counts":
@@ -81,6 +82,7 @@ class ScanCorrection:
         self._light = ViewLight.of(source, None if self._beam is None else self._beam.used)
         self._stream: Correction | LineIntegralCorrection | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
+        self._fed = np.zeros(0, np.int64)
 
     @property
     def photons(self) -> Photons | None:
@@ -182,8 +184,9 @@ class ScanCorrection:
         asked = frames
         data, frames = self._read(frames, None)
         self._tell_unlit(asked, frames)
+        self._fed = np.append(self._fed, frames)
         if self._stream is None:
-            self._stream = self._correction(None)
+            self._stream, self._fed_by = self._correction(None), self._shadow
         if not frames.size and not (last and self._stream is not None and self._stream.spots.waiting):
             return None
         part = self._corrected(self._stream, data, frames, last)
@@ -209,7 +212,7 @@ class ScanCorrection:
         if self._beam is None:
             return np.zeros((0, 0, 0), np.float32)
         flats = self._beam.used.flats[-1][:most]
-        exposures = float(np.median(self._source.exposures[flats])) / usual_exposure(self._source)
+        exposures = float(np.median(self._source.table.exposures[flats])) / usual_exposure(self._source)
         return self.quiet().at_once(flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
 
     @property
@@ -220,9 +223,12 @@ class ScanCorrection:
 
     @property
     def outdated(self) -> bool:
-        """Whether views already fed would now be corrected differently: by references that came later, or other air
-        columns.
+        """Whether views already fed would now be corrected differently: by references that came later, other air
+        columns, or neighbours in angle that were not taken beside them.
         """
+        finds_spots = np.isfinite(self._selection.step(Preparation).zinger_threshold)
+        if finds_spots and (np.diff(self._by_angle(self._fed)) != 1).any():
+            return True
         if self._beam is None or self._stream is None:
             return False
         more = count_references(self._source) != self._beam.n_references
@@ -230,9 +236,10 @@ class ScanCorrection:
 
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
         """Whether an object stands in the beam of these views of a finished scan that `feed` took for sample."""
-        unknown = self._shadow is None
         self._look_for_shadow(views)
-        return unknown and self._shadow is not None and any(part.any() for part in self._shadow)
+        return (
+            self._shadow is not self._fed_by and self._shadow is not None and any(part.any() for part in self._shadow)
+        )
 
     def quiet(self) -> ScanCorrection:
         """A correction with the same references for a few views, without warnings."""
@@ -259,7 +266,8 @@ class ScanCorrection:
             dark = frames[~alive]
             if rows is None:  # in a band it says nothing of the views
                 self._warn(
-                    f"{dark.size} of {len(frames)} views hold no finite pixel (first: frame {dark[0]}): left out."
+                    f"{dark.size} of {self._source.table.views.size} views hold no finite pixel (first: frame "
+                    f"{dark[0]}): left out."
                 )
             data, frames = data[alive], frames[alive]
         lit = np.ones(len(frames), np.bool_)
@@ -280,7 +288,8 @@ class ScanCorrection:
         copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
         if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
             self._warn(
-                f"{count(len(copies), 'view')} of {len(frames)} (frames {spans(copies)}) hold the pixels of the view "
+                f"{count(len(copies), 'view')} of {self._source.table.views.size} "
+                f"(frames {spans(copies)}) hold the pixels of the view "
                 "before: the camera or its driver gave an image twice. Their angles are then wrong for what they show: "
                 "leave them out with --views or --flags judge, or repeat them."
             )
@@ -305,7 +314,8 @@ class ScanCorrection:
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self._source, asked, lit)) else ""
         self._named_unlit.update(news.tolist())
         self._warn(
-            f"{count(news.size, 'view')} of {asked.size} (frames {spans(news.tolist())}) have no light: the shutter "
+            f"{count(news.size, 'view')} of {self._source.table.views.size} "
+            f"(frames {spans(news.tolist())}) have no light: the shutter "
             f"was closed, the beam was gone, or the file was never written there. They are left out{gap}."
         )
 
@@ -322,12 +332,12 @@ class ScanCorrection:
         elif views.size >= SHADOW_VIEWS:
             given = read_binned(self._source, some, read, self.binning)
             lines = LineIntegralCorrection(np.inf).transmission(given, some.astype(np.float64), some).data
-            foreign = foreign_rows(np.exp(-lines), self._source.angles[some])
+            foreign = foreign_rows(np.exp(-lines), self._source.table.angles[some])
             self._shadow = np.zeros(lines.shape[1:], np.bool_), foreign
 
     def _by_angle(self, frames: NDArray[np.int64]) -> NDArray[np.intp]:
         """The order of frames in which neighbours are beside each other: as taken, unless that skips angles."""
-        angles = self._source.angles[frames]
+        angles = self._source.table.angles[frames]
         steps = np.diff(np.unwrap(angles))
         in_time = (steps >= 0).all() or (steps <= 0).all()
         return np.arange(frames.size) if in_time else np.argsort(angles, kind="stable")

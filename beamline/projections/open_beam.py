@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError
 from beamline.core.sinks import Warn
+from beamline.monitor.evidence import lit_places
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import (
@@ -23,7 +24,6 @@ from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups, views_differ
-from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
 from recon.base.views import spread
@@ -65,7 +65,7 @@ class OpenBeam:
         Args:
             read: detector rows that are read.
             rows: those of them that are wanted.
-            warn: takes a sentence on damaged frames, and on parts of the scan without flats.
+            warn: takes a sentence on damaged frames, on spots, and on parts of the scan without flats.
 
         Raises:
             ConfigError: counted photons without the counts of a photon, too few flats, or a file without ring current.
@@ -75,7 +75,7 @@ class OpenBeam:
         alike = not (asked.by_current or views_differ(source))
         light, n = None if alike else light_scale(source, asked.by_current), count_references(source)
         used = groups_taken(source) if asked.accepted else reference_groups(source)
-        references = read_references(source, used, read, selection)
+        references = read_references(source, used, read, selection, warn)
         if asked.flat_fields == "dynamic":
             references = with_dynamic_flats(source, used, references, read, selection)
         tell_damaged(source, selection, np.concatenate([*used.darks, *used.flats]), warn)
@@ -135,13 +135,13 @@ class OpenBeam:
             data = np.nan_to_num(read_binned(source, views, read, binning))
             light = Correction(references.rows(rows), settings).transmission(data, views.astype(np.float64)).data
             in_shadow[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
-            foreign[rows] |= foreign_rows(light, source.angles[views])
+            foreign[rows] |= foreign_rows(light, source.table.angles[views])
         return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow, foreign
 
 
 def count_references(source: ScanSource) -> int:
     """Numbers of darks and flats in the file so far."""
-    return int(np.isin(source.image_key, (FrameKind.DARK, FrameKind.FLAT)).sum())
+    return source.table.darks.size + source.table.flats.size
 
 
 _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
@@ -198,12 +198,13 @@ def photons_of(
 
 
 def light_of(references: References, photons: Photons) -> float:
-    """Photons per pixel in the open beam, the median of the flats."""
+    """Photons per pixel in the open beam, the median of the flats where the beam is, see `lit_places`."""
     return _counts_of_light(references) / photons.gain
 
 
 def _counts_of_light(references: References) -> float:
-    return float(np.median(references.flats[0][1] - references.dark))
+    light = references.flats[0][1] - references.dark
+    return float(np.median(light[lit] if (lit := lit_places(light)).any() else light))
 
 
 def noise_sentence(references: References, photons: Photons | None) -> str:

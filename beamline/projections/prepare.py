@@ -27,14 +27,12 @@ from beamline.projections.scan_warnings import (
     warn_of_other_axis,
     warn_of_the_field,
     warn_of_units,
-    warn_of_unmeasured_rows,
 )
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import ViewGeometry, checked_views
 from beamline.storage.readers.base import ScanSource
-from drivers.base.frame import FrameKind
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
@@ -163,7 +161,7 @@ def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[Usabl
         require_stated(poses, source, selection, usable.frames[first])
         aside = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
         return replace(usable, frames=usable.frames[~aside]), poses, usable.frames[aside]
-    return usable, poses, np.flatnonzero(source.image_key == FrameKind.WIDE_VIEW)
+    return usable, poses, source.table.wide_views
 
 
 def _chosen(
@@ -207,7 +205,7 @@ def _after_scan_steps(
     done, steps = dict(prepared.done), [step for step in in_order(selection) if isinstance(step, ScanStep)]
     prepared = replace(prepared, done=done)  # a step sees what those before it did
     for n, step in enumerate(steps, 1):
-        done[step.name] = step.apply(prepared, source.angles[prepared.projections.view_ids], phases.progress)
+        done[step.name] = step.apply(prepared, source.table.angles[prepared.projections.view_ids], phases.progress)
         phases.progress(n, len(steps))
     return prepared
 
@@ -253,7 +251,6 @@ def assemble(
     """
     rows, (height, width) = rows_of(source, selection), geometry.detector_shape
     binning, first = selection.binning, ViewFilters.of(source, selection).read(None).start
-    report_defects(projections, first, binning, warn)
     ids = projections.view_ids
     if ids.size < 2:
         raise DataError(f"{source.path}: only {ids.size} of the chosen views can be used; at least 2 are needed.")
@@ -276,7 +273,7 @@ def assemble(
         axis_col=axis_col,
         axis=estimate,
         held_out=None,
-        n_projections=int((source.image_key == FrameKind.PROJECTION).sum()),
+        n_projections=source.table.views.size,
         length_unit="px" if pixel_size(source, selection) is None else "mm",
         quantity=source.quantity,
         view_weights=usable.weights_of(ids),
@@ -288,7 +285,7 @@ def assemble(
         stretch=_stretch(source, geometry, resampled=resampling is not None),
         sample_radius=_stated_radius(source, selection),
     )
-    warn_of_unmeasured_rows(prepared, warn)
+    report_defects(prepared, first, binning, warn)
     warn_of_the_field(source, selection, prepared.ordinary, warn)
     return prepared
 

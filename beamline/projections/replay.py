@@ -14,7 +14,7 @@ from beamline.monitor.references import ReferenceLimits
 from beamline.monitor.watch import look_past_failures, start
 from beamline.projections.replayed_frames import context_of, frames_of
 from beamline.storage.flag_legend import FrameFlags
-from beamline.storage.readers.base import ScanSource, rows_replaced
+from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.references import reference_groups
 from beamline.storage.rules.scan import altered_sentence
 from drivers.base.clock import Clock
@@ -166,7 +166,7 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
         limits: of darks and flats; None: those of a new scan.
     """
     flags = [flag for each in judged for flag in each.flags]
-    again = frozenset(rows_replaced(source).tolist())
+    again = frozenset(source.table.replaced.tolist())
     found = reference_groups(source, limits).findings if source.quantity == "counts" else ()
     failures = tuple(failure for each in judged for failure in each.failures)
     return ScanVerdict(
@@ -175,7 +175,7 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
         alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),
         retaken=tuple(sorted(again)),
         references=tuple(finding.message for finding in found if finding.frames),
-        altered=altered_sentence(source) if source.altered else "",
+        altered=altered_sentence(source) if source.table.altered.any() else "",
         aside=failures + (judged[-1].aside.in_words() if judged else ()),
     )
 

@@ -19,7 +19,7 @@ from beamline.monitor.watch import usual_step
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.averaged import stated_frames_per_view
-from beamline.storage.readers.base import ScanSource, read_known, rows_replaced
+from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.angles import FARTHEST
 from beamline.storage.writer_lock import PATIENCE, WriterWatch
 from drivers.base.clock import Clock
@@ -41,7 +41,7 @@ def frames_of(
     """
     done = 0
     for n in growing(source, follow) if follow is not None else (source.refresh(),):
-        again = frozenset(rows_replaced(source).tolist())
+        again = frozenset(source.table.replaced.tolist())
         for frame in _frames(source, done):
             if should_stop():
                 return
@@ -109,7 +109,7 @@ def _step(source: ScanSource) -> float:
     planned = source.plan.get("angles_deg")
     if isinstance(planned, list) and all(isinstance(angle, int | float) for angle in planned):
         return usual_step(np.radians(planned[:: stated_frames_per_view(source)]))
-    return usual_step(source.angles[source.image_key == FrameKind.PROJECTION])
+    return usual_step(source.table.angles[source.table.views])
 
 
 def _saturation(source: ScanSource) -> float:
@@ -121,7 +121,7 @@ def _saturation(source: ScanSource) -> float:
     if 0 < stated <= np.iinfo(source.dtype).max:
         return stated
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
-        rows = np.flatnonzero(source.image_key == kind)
+        rows = source.table.of_kind(kind)
         for row in spread(rows, SAMPLES):
             image = read_known(source, [int(row)])[0]
             largest = float(image.max())
@@ -131,26 +131,18 @@ def _saturation(source: ScanSource) -> float:
 
 
 def _frames(source: ScanSource, first: int) -> Iterator[Frame]:
-    """Frames from `first` on. An angle that no stage reaches becomes NaN. An unknown exposure becomes 1 s, so that
-    views and flats agree."""
-    for frame in source.frames(first) if source.dtype == np.uint16 else _plain_frames(source, first):
-        angle = frame.angle if abs(frame.angle) <= math.radians(FARTHEST) else math.nan
-        yield replace(frame, angle=angle, exposure=frame.exposure if frame.exposure > 0 else 1.0)
-
-
-def _plain_frames(source: ScanSource, first: int) -> Iterator[Frame]:
-    """Frames of other types than a camera's: counts as they are, line integrals as counts of a beam."""
-    for row in range(first, source.image_key.size):
-        pixels: NDArray[Any] = read_known(source, [row])[0]
+    """Frames from `first` on: counts as they are, line integrals as counts of a beam. An angle that no stage reaches
+    becomes NaN. An unknown exposure becomes 1 s, so that views and flats agree."""
+    for frame in source.frames(first):
+        pixels: NDArray[Any] = frame.counts
         if source.quantity == "line_integrals":
             with np.errstate(over="ignore"):
                 pixels = np.nan_to_num(BEAM * np.exp(-pixels.astype(np.float64)), posinf=65535).clip(0, 65535)
             pixels = pixels.round().astype(np.uint16)
         elif (kernel := _type_of_kernels(pixels.dtype)) != pixels.dtype:
             pixels = pixels.astype(kernel)
-        kind, angle = FrameKind(int(source.image_key[row])), float(source.angles[row])
-        kind = FrameKind.INVALID if row in source.unreadable else kind
-        yield Frame(pixels, kind, row, row, -1, angle, np.nan, float(source.exposures[row]))
+        angle = frame.angle if abs(frame.angle) <= math.radians(FARTHEST) else math.nan
+        yield replace(frame, counts=pixels, angle=angle, exposure=frame.exposure if frame.exposure > 0 else 1.0)
 
 
 def _type_of_kernels(dtype: np.dtype[Any]) -> np.dtype[Any]:

@@ -59,7 +59,7 @@ def statistics_of(
     total."""
     chosen = {}
     for kind in kinds:
-        rows = np.flatnonzero(source.image_key == kind)
+        rows = source.table.of_kind(kind)
         if rows.size:
             chosen[kind] = spread(rows, FRAMES), rows.size
     total, done = 2 * sum(rows.size for rows, _ in chosen.values()), 0
@@ -134,7 +134,7 @@ class LightAsked:
         Raises:
             ConfigError: there are no darks and flats, or the scan does not state what a dose needs.
         """
-        if not {FrameKind.DARK, FrameKind.FLAT} <= set(source.image_key):
+        if not source.table.has(FrameKind.DARK, FrameKind.FLAT):
             raise ConfigError(f"{source.path} has no darks and flats, which are needed to measure the light.")
         if self.material is not None:
             _gray(self.material, source, 0.0)
@@ -188,12 +188,12 @@ def light_of(source: ScanSource, statistics: list[KindStatistics], asked: LightA
     asked.refuse_impossible(source)
     mean = {each.kind: each.mean for each in statistics}
     photons = (mean[FrameKind.FLAT] - mean[FrameKind.DARK]) * asked.photons_per_count
-    seconds = (source.exposures[source.image_key == kind] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
+    seconds = (source.table.exposures[source.table.of_kind(kind)] for kind in (FrameKind.PROJECTION, FrameKind.FLAT))
     known = [each[np.isfinite(each)] for each in seconds]
     if all(each.size for each in known):  # else of one exposure time
         photons *= float(known[0].mean() / known[1].mean())
     photons *= source.frames_per_view
-    views = int(np.count_nonzero(source.image_key == FrameKind.PROJECTION))
+    views = source.table.views.size
     if asked.material is None:
         return Light(views, photons)
     return Light(

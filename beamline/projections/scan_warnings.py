@@ -19,9 +19,7 @@ from beamline.projections.selection import Selection, pixel_size
 from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.light import without_air
-from drivers.base.frame import FrameKind
 from recon.base.masks import areas
-from recon.prep.correct import Projections
 from recon.voxels.direct import has_direct_method
 from recon.voxels.field_edges import FieldEdges
 
@@ -65,13 +63,14 @@ def warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float
 def warn_of_the_field(source: ScanSource, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
     """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
     projections, geometry = prepared.projections, prepared.geometry
-    edges, unlevelled = FieldEdges.of(projections.data, geometry), not any(projections.air_columns)
+    edges = FieldEdges.of(projections.data, geometry, prepared.shares)
+    unlevelled = not any(projections.air_columns)
     if sides := edges.beyond():
         light = ""
         if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
             light = without_air(source, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
-        wide = not geometry.ordinary.all() or bool((source.image_key == FrameKind.WIDE_VIEW).any())
+        wide = not geometry.ordinary.all() or bool(source.table.wide_views.size)
         warn(f"{cut_sentence(sides, continued, wide)} {light}".rstrip())
         if unlevelled and (change := uncorrected_current(source, selection)):
             warn(change)
@@ -93,19 +92,6 @@ def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
     )
 
 
-def warn_of_unmeasured_rows(prepared: PreparedProjections, warn: Warn) -> None:
-    """Name the slices (of a cone, rows) that no ray measured."""
-    what = "slice" if prepared.geometry.rows_show_slices else "row"
-    lost, between = prepared.unmeasured_rows
-    for rows, so in (np.setdiff1d(lost, between), "0 in the volume"), (between, "interpolated from their neighbours"):
-        if rows.size:
-            warn(
-                f"No ray measured {count(rows.size, what)} of {len(prepared.projections.masked)} (from 0: "
-                f"{spans(rows.tolist())}): in all views these rows have no beam, no finite values, or dead pixels. "
-                f"They are {so if what == 'slice' else 'not used'}."
-            )
-
-
 def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str:
     """A warning for `FieldEdges.passing`."""
     words = " and ".join(f"at the {side} edge in views {first} to {last}" for side, (first, last) in ranges.items())
@@ -117,14 +103,18 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
     )
 
 
-def report_defects(projections: Projections, first_row: int, binning: int, warn: Warn) -> None:
-    """Report what measured nothing, by frames, rows and columns, and repaired pixels if more than one in a thousand.
+def report_defects(prepared: PreparedProjections, first_row: int, binning: int, warn: Warn) -> None:
+    """Name slices (of a cone, rows) that no ray measured; beside them what measured nothing, by frames, rows and
+    columns, spots left as they are, and repaired pixels if more than one in a thousand.
 
     Args:
         first_row: of the detector, at which the (binned) rows begin.
     """
-    unseen, runs = areas(projections.masked), projections.unmeasured
-    runs = runs[~np.asarray(projections.masked.all(axis=1))[runs[:, 1]]]
+    what = "slice" if prepared.geometry.rows_show_slices else "row"
+    projections, (lost, between) = prepared.projections, prepared.unmeasured_rows
+    masked, runs = projections.masked.copy(), projections.unmeasured
+    masked[lost] = False
+    unseen, runs = areas(projections.masked) & masked, runs[~np.isin(runs[:, 1], lost)]
     if runs.size:
         frames, within = np.unique(runs[:, 0]), first_row + np.arange(binning)
         rows = spans((binning * np.unique(runs[:, 1])[:, None] + within).ravel().tolist(), 4)
@@ -136,10 +126,15 @@ def report_defects(projections: Projections, first_row: int, binning: int, warn:
             "where views were shifted or turned before, or something opaque in the beam that is not the sample, such "
             "as a post or a clamp. These rays have no weight."
         )
+    if projections.left:
+        large = (
+            f"{projections.left} pixels brighter than the open beam are of spots of more than 3 x 3 pixels, which stay"
+        )
+        warn(Note(f"{large} and make streaks: shield the detector against scattered and direct X-rays."))
     shares = (
         (unseen.mean(), Note, "of the detector got no beam, or is saturated: its rays count as not measured."),
         (
-            (projections.masked & ~unseen).mean(),
+            (masked & ~unseen).mean(),
             Note,
             "of the detector's pixels are dead or hot and were filled from their neighbours.",
         ),
@@ -158,3 +153,10 @@ def report_defects(projections: Projections, first_row: int, binning: int, warn:
     for share, kind, text in shares:
         if share > 1e-3:
             warn(kind(f"{share:.1%} {text}"))
+    for some, so in (np.setdiff1d(lost, between), "0 in the volume"), (between, "interpolated from their neighbours"):
+        if some.size:
+            warn(
+                f"No ray measured {count(some.size, what)} of {len(masked)} (from 0: {spans(some.tolist())}): in all "
+                "views these rows have no beam, zeros, no finite values, or dead pixels. "
+                f"They are {so if what == 'slice' else 'not used, and voxels that other rows do not show are 0'}."
+            )

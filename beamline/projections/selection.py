@@ -82,7 +82,7 @@ def choose_views(
         ConfigError: the selection is not legal, or leaves fewer than two views.
     """
     try:
-        chosen = parse_views(selection.views, source.angles[frames], selection.seed, period=period)
+        chosen = parse_views(selection.views, source.table.angles[frames], selection.seed, period=period)
     except ValueError as error:
         raise ConfigError(f"--views: {error}") from error
     if chosen.size < 2:

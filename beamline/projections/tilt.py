@@ -35,7 +35,7 @@ def warn_of_tilt(
     rows = (correction.rows.stop - correction.rows.start) // correction.binning
     if rows < _FEWEST_ROWS:
         return
-    frames = spread_views(source.angles[frames], _VIEWS, frames)
+    frames = spread_views(source.table.angles[frames], _VIEWS, frames)
     try:
         shown = shown_tilt(source, correction, frames, (_BANDS, _BAND_ROWS), progress)
     except (ValueError, DataError):
@@ -82,7 +82,7 @@ def shown_tilt(
     progress(bands, bands)
     if len(means) < FEWEST_BANDS:
         raise ValueError(f"{len(means)} bands of rows; at least {FEWEST_BANDS} are needed")
-    return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.angles[ids])
+    return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.table.angles[ids])
 
 
 def tilt_text(tilt: float, uncertainty: float) -> str:

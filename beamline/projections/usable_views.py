@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.text import count
-from drivers.base.frame import FrameKind
 from recon.base.arrays import I64, bin_views
 
 if TYPE_CHECKING:
@@ -130,7 +129,7 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
     """
     from beamline.storage.rules.treatment import treatment_of
 
-    views, flags = source.image_key == FrameKind.PROJECTION, source.flags if judged is None else judged
+    views, flags = source.table.are_views, source.table.flags if judged is None else judged
     rows = np.flatnonzero(views)
     if flags is None or not flags.flagged.any():
         return UsableViews(rows, flags=flags)
@@ -157,7 +156,7 @@ def gap_sentence(source: ScanSource, before: NDArray[np.int64], after: NDArray[n
     empty.
     """
     period = np.pi if source.cone is None else 2 * np.pi
-    narrow, wide = (_widest_gap(source.angles[some], period) for some in (before, after))
+    narrow, wide = (_widest_gap(source.table.angles[some], period) for some in (before, after))
     return f" leave {np.degrees(wide):.3g}° without a view" if wide >= WIDE * narrow else ""
 
 

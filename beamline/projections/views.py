@@ -21,14 +21,15 @@ from beamline.projections.selection import Selection, choose_views, geometry_of
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.transforms import WRAPPED
 from beamline.storage.rules import Finding, angles_shown
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.pixels import numbers_wrapped, quantity_stated
 from beamline.storage.rules.references import references_usable
-from beamline.storage.rules.scan import central_ray_taken, references_present, scan_ended, scan_findings
+from beamline.storage.rules.scan import VARYING, central_ray_taken, references_present, scan_ended, scan_findings
+from beamline.storage.rules.stored_order import SINOGRAM
 from beamline.storage.rules.treatment import frames_flagged
-from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 
 
@@ -41,14 +42,14 @@ def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
         ConfigError: the selection does not fit the scan.
         DataError: the poses do not fit the scan.
     """
-    frames = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
+    frames = source.table.placed_views
     poses = poses_of(source, selection, frames)
     if poses is not None:
         frames = frames[poses.stated(frames)]
     frames = frames[choose_views(source, frames, selection)]
     stated = source.axis_col if selection.axis_col is None else selection.axis_col
     axis_col = (source.shape[1] - 1) / 2 if stated is None else stated
-    geometry = geometry_of(source, selection, axis_col, source.angles[frames])
+    geometry = geometry_of(source, selection, axis_col, source.table.angles[frames])
     if poses is not None:
         geometry = poses.corrected(geometry, frames)
     return selection.step(Width).rays(source, selection, geometry)[0]
@@ -103,8 +104,8 @@ class ViewGeometry:
 
     def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
         """The geometry of views without calibration."""
-        geometry = geometry_of(self.source, part, self.stated_axis, self.source.angles[view_ids])
-        if (aside := self.source.aside_mm) is not None:
+        geometry = geometry_of(self.source, part, self.stated_axis, self.source.table.angles[view_ids])
+        if (aside := self.source.table.aside) is not None:
             geometry = replace(geometry, shifts=np.outer(aside[view_ids] / geometry.pixel_pitch, (1.0, 0.0)))
         for motion in self.moved.values():
             geometry = motion.corrected(geometry, view_ids)
@@ -131,10 +132,16 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
         DataError: it cannot be reconstructed; with every reason, and what to do about each.
     """
     asked = selection.step(Preparation)
+    if selection.cone is not None:  # what the rules judge is the beam that is taken
+        source = Frames(source, cone=selection.cone)
     judged = judged_flags(source) if asked.judged and source.finished else None
-    findings = [*scan_findings(source), *scan_ended(source)]
-    by_option = {"central-column": selection.axis_col, "central-row": selection.central_row}
-    findings += [hit for hit in central_ray_taken(source, selection.cone) if by_option[hit.rule] is None]
+    by_option = {
+        "central-column": selection.axis_col,
+        "central-row": selection.central_row,
+        VARYING: selection.pixel_size_mm if selection.cone is None else selection.cone,
+    }
+    findings = [*scan_findings(source), *scan_ended(source), *central_ray_taken(source)]
+    findings = [hit for hit in findings if by_option.get(hit.rule) is None]
     findings += [*references_usable(source, asked.accepted), *darks_beside_views(source, asked.accepted)]
     if asked.uses_flags:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
@@ -145,8 +152,8 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     if usable.sentence:
         warn(Note(usable.sentence))
     for finding in findings:
-        if finding.severity == "warning":
-            warn(finding.message)
+        if finding.severity == "warning" or finding.rule == SINOGRAM:
+            warn(finding.message if finding.severity == "warning" else Note(finding.message))
     return usable
 
 

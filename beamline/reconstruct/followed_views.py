@@ -83,7 +83,7 @@ class FollowedViews:
     @property
     def n(self) -> int:
         """Number of views in the file, flagged ones included."""
-        return int(np.sum(self.source.image_key == FrameKind.PROJECTION))
+        return self.source.table.views.size
 
     def usable(self) -> UsableViews:
         """The views in the file that may be used."""
@@ -93,7 +93,7 @@ class FollowedViews:
         """Which of these frames the selection uses, by their index among all views so far, which later views do not
         change.
         """
-        taken = np.flatnonzero(np.isin(self.source.image_key, (FrameKind.PROJECTION, FrameKind.INVALID)))
+        taken = self.source.table.of_kind(FrameKind.PROJECTION, FrameKind.INVALID)
         chosen = parse_views(self.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[chosen])]
 
@@ -103,7 +103,7 @@ class FollowedViews:
 
     def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, StepDone]:
         """The geometry of views with the width of their rays, and what was done about that."""
-        geometry = geometry_of(self.source, self.selection, axis_col, self.source.angles[view_ids])
+        geometry = geometry_of(self.source, self.selection, axis_col, self.source.table.angles[view_ids])
         return self.selection.step(Width).rays(self.source, self.selection, geometry)
 
     def angles(self, axis_col: float, view_ids: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -147,20 +147,21 @@ class AxisSearch:
         if cone_of(self._source, self._selection) is not None:
             self.col, self.settled = stated_axis(self._source), True
             return
-        before, self._turned = self._turned, float(np.ptp(self._source.angles[views])) * (1 + 1.5 / views.size)
+        before, self._turned = self._turned, float(np.ptp(self._source.table.angles[views])) * (1 + 1.5 / views.size)
         passed = any(before < turn <= self._turned for turn in (np.pi / 2, np.pi)) and views.size > _FIRST_VIEWS
         if views.size < self._next and not passed and not ended:
             return
         self._next, self.settled = views.size + views.size // 2, ended
-        self._search(correction, views, ended and self.col is None)
+        self._search(correction, views, ended)
         if self.col is None and np.pi / 2 <= self._turned < np.pi and not self._told:
             self._told = True
             self._warn(_UNKNOWN)
 
-    def _search(self, correction: ScanCorrection, views: NDArray[np.int64], last_chance: bool) -> None:
+    def _search(self, correction: ScanCorrection, views: NDArray[np.int64], ended: bool) -> None:
+        last_chance = ended and self.col is None
         warn = self._warn if last_chance else lambda sentence: None  # the axis will be searched again
         try:
-            axis_col, estimate = locate_axis(self._source, correction, views, warn, all_there=last_chance)
+            axis_col, estimate = locate_axis(self._source, correction, views, warn, all_there=ended)
         except DataError:  # the views do not cover enough angles yet
             if last_chance:
                 raise
@@ -191,7 +192,7 @@ class PassLaws:
         It is measured on ordinary views. Where there are wide ones, the density beside the field is known, and the
         offset of the law is 0. What prevents a law becomes a warning, and the reason in an event without its numbers.
         """
-        ends = self._views.source.pass_ends
+        ends = self._views.source.table.pass_ends
         if not ends.size or (end := int(ends[-1])) == self._end:
             return
         references_follow = correction is None and cursor.behind
@@ -222,7 +223,7 @@ class PassLaws:
         except (ValueError, DataError, MemoryError) as error:
             self._no_law(ends.size, rows.size, str(error) or "the memory does not suffice")
             return
-        if (self._views.source.image_key[:end] == FrameKind.WIDE_VIEW).any() and law.offset < 1:
+        if (self._views.source.table.wide_views < end).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
         self._warn.withdraw(_NO_GAIN)
         self._sink(LawMeasured(ends.size, **vars(law), gained=gained, time=self._clock.now()))

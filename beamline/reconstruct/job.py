@@ -7,6 +7,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 import recon
@@ -42,7 +43,10 @@ from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.in_time import LastRound
+from recon.voxels.projector import measured_share
 from recon.warm_up import warm_up
+
+_GUESSED = 0.5  # of the rays of a voxel, by which FDK that fills their rows only guesses it
 
 
 def progress_events(
@@ -185,11 +189,17 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct in slabs, or at once; returns the volume, 0 in slices that no ray measured, and the views as used."""
+    """Reconstruct in slabs, or at once; returns the volume, 0 where no ray measured it, and the views as used.
+
+    FDK takes filled rows where others see a voxel, too; one of which they are half the rays is not measured either.
+    """
     made, used = _volume_of(job, decided)
-    lost = [row for row in used.unmeasured_rows[0] if row not in used.unmeasured_rows[1]]
-    if lost and used.geometry.rows_show_slices and len(made.volume.data) == used.geometry.detector_shape[0]:
-        made.volume.data[lost] = 0
+    lost, volume, geometry = np.setdiff1d(*used.unmeasured_rows), made.volume, used.geometry
+    if lost.size and geometry.is_cone:
+        share = measured_share(~np.isin(np.arange(geometry.detector_shape[0]), lost), geometry, volume.grid)
+        volume.data[share <= (_GUESSED if job.method.traits.direct else 0)] = 0
+    elif lost.size and geometry.rows_show_slices and len(volume.data) == geometry.detector_shape[0]:
+        volume.data[lost] = 0
     return made, used
 
 

@@ -23,7 +23,6 @@ from beamline.core.sinks import Warnings
 from beamline.core.text import count, frames_text
 from beamline.projections.consistency import compare_with_flats
 from beamline.projections.correction import ScanCorrection
-from beamline.projections.corrections.width import Width
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import JumpStep, PlaceStep, ScanStep
@@ -31,28 +30,32 @@ from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import checked_views, correction_blockers, refuse
+from beamline.projections.views import ViewGeometry, checked_views, correction_blockers, refuse
 from beamline.reconstruct.followed_views import AxisSearch, Cursor, FollowedViews, FollowState, PassLaws
 from beamline.reconstruct.job import corrections_done, progress_events
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
-from drivers.base.frame import FrameKind
 from recon.base.method import Progress
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.in_time import LastRound
 from recon.splatting.stream import StreamingFit
 
+_NONE = np.empty(0, np.int64)
 BATCH_VIEWS = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
 _BEHIND = 0.5  # steps a view: with fewer, FBP shows more of the views (tests/bench/test_live_accuracy.py)
 _AXIS_MOVES = 1.0  # px: a larger move of the axis restarts the fit
 
 # Why all views are corrected again.
-_OUTDATED = "Flats or darks came after views, or air columns changed: all views are corrected again"
+_OUTDATED = (
+    "Flats or darks came after views, air columns changed, or views between others came later, beside which spots "
+    "show: all views are corrected again"
+)
 _NEXT_PART = "Views of the next part of the run begin: all views are corrected again, each by the flats of its own part"
 _SEVERAL_PARTS = "The run has several parts: at its end all views are corrected again, in one piece"
+_WIDE = "The wide views of the scan are corrected with all others, as the volume of a wide sample takes them"
 _SHADED = "Something stands in the beam of all views, though not of the flats: all views are corrected again without it"
 
 
@@ -159,7 +162,7 @@ class ScanFollower:
         if self._fit is None:
             self._fit = self._new_fit(self.axis_col)
         new = views[views >= self._cursor.taken]
-        parts = np.searchsorted(self.source.part_starts, new, "right") - 1
+        parts = np.searchsorted(self.source.table.part_starts, new, "right") - 1
         if new.size and parts[0] != self._cursor.part:
             self._begin_part(int(parts[0]))
         batch = new[parts == parts[:1]][:BATCH_VIEWS]
@@ -183,7 +186,7 @@ class ScanFollower:
     def _settle_newest(self) -> None:
         """Correct the newest view for good: no other comes that it waits for."""
         if self._cursor.newest is not None:
-            self._feed(np.empty(0, np.int64), last=True)
+            self._feed(_NONE, last=True)
 
     def _feed(self, frames: NDArray[np.int64], last: bool) -> None:
         """Correct frames and feed the fit with them, also with the newest, whose correction waits for the next one."""
@@ -227,11 +230,11 @@ class ScanFollower:
         self._cursor = replace(self._cursor, newest=None)  # the next views bring it again
         return fit
 
-    def correct_again(self, usable: UsableViews, why: str) -> None:
+    def correct_again(self, usable: UsableViews, why: str, wide: NDArray[np.int64] = _NONE) -> None:
         """Recompute line integrals with all references and air columns, replacing those that the model was fitted to.
 
-        Does nothing if the views are of one part, references and air columns are unchanged, and nothing stands in the
-        beam of all views. `why` is reported, unless views are unlearned.
+        Does nothing if the views are of one part, references and air columns are unchanged, nothing stands in the beam
+        of all views, and no wide ones (rows of the file) join them. `why` is reported, unless views are unlearned.
 
         Some of these views may become unusable: a check found them bad when it had seen later ones, or they were taken
         again. Then the model goes on without them, at the first rates.
@@ -242,7 +245,7 @@ class ScanFollower:
         frames = fed[kept]
         gone = fed.size - frames.size
         shaded = self._correction.finds_shadow(frames)
-        if not (gone or shaded or self._correction.outdated or self.source.part_starts.size > 1):
+        if not (gone or shaded or wide.size or self._correction.outdated or self.source.table.part_starts.size > 1):
             return
         if shaded:
             why = _SHADED
@@ -251,9 +254,10 @@ class ScanFollower:
         self._sink(StateEntered("correcting", why, time=self._clock.now()))
         self._correction = self._correction.renewed()
         self._cursor = replace(self._cursor, batches=())  # not both in memory
-        again = self._correction.at_once(frames)
+        again = self._correction.at_once(np.union1d(frames, wide))
         self._cursor = replace(self._cursor, batches=(again,))
-        self._fit.replace_views(again.data, kept if gone else None)
+        ordinary = again.data[~np.isin(again.view_ids, wide)] if wide.size else again.data
+        self._fit.replace_views(ordinary, kept if gone else None)
 
     def advance(self, seconds: float) -> bool:
         """Fit for a while; returns False if there is nothing to fit yet."""
@@ -305,7 +309,8 @@ class ScanFollower:
         self.snapshots.write(self._fit, float(self.axis_col or 0.0))
 
     def prepared(self) -> PreparedProjections:
-        """All views, with their final correction, as the model was fitted to them. No view is added afterwards.
+        """All views, with their final correction, as the model was fitted to them, and wide ones. No view is added
+        afterwards.
 
         Raises:
             DataError: a scan without two views that can be used.
@@ -314,18 +319,15 @@ class ScanFollower:
         assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
-        if wide := int((self.source.image_key == FrameKind.WIDE_VIEW).sum()):
-            self._warn(
-                f"{count(wide, 'wide view')} of this scan are not used: this volume grew with the scan, from ordinary "
-                f"views. `beamline recon {self.source.path}` uses them, which gives densities near the axis."
-            )
         steps = in_order(self._options.selection)
         if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
                 "`beamline recon` on the finished file leaves out the views of the shorter side."
             )
-        self.correct_again(usable, _OUTDATED if self._correction.outdated else _SEVERAL_PARTS)
+        wide = self.source.table.wide_views
+        why = _OUTDATED if self._correction.outdated else _WIDE if wide.size else _SEVERAL_PARTS
+        self.correct_again(usable, why, wide)
         return self._prepared(self.axis_col, usable)
 
     def last_round(self, seconds: float, snapshot_every: float) -> LastRound:
@@ -358,23 +360,25 @@ class ScanFollower:
         """All views, now that they are there, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
         selection, projections = self._options.selection, self._joined()
-        geometry, width = self.views.geometry(axis_col, projections.view_ids)
-        axis = axis_col, self._axis.estimate
+        places = ViewGeometry(self.source, selection, axis_col)
+        geometry, axis = places.of(projections.view_ids), (axis_col, self._axis.estimate)
         compare_with_flats(self.source, selection, projections, self._warn, refused=False)
         prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
-        done = {**self._correction.done, Width.name: width}
+        done = {**self._correction.done, **places.done}
         for step in in_order(selection):
             if isinstance(step, PlaceStep):
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved
             if isinstance(step, ScanStep):
                 try:
-                    done[step.name] = step.apply(prepared, self.source.angles[projections.view_ids], lambda n, of: None)
+                    done[step.name] = step.apply(
+                        prepared, self.source.table.angles[projections.view_ids], lambda n, of: None
+                    )
                 except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue
                 if done[step.name].sentence:
                     self._tell({step.name: done[step.name]})
-                    self._fit.replace_views(projections.data)
+                    self._fit.replace_views(prepared.ordinary.projections.data)
         return replace(prepared, done=done)
 
     def _tell(self, done: Mapping[str, StepDone]) -> None:

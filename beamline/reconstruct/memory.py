@@ -46,6 +46,7 @@ class ReconMemory:
         bars: error bars are made, too.
         radius: mm from the rotation axis to the end of a sample wider than the field; None: it ends within.
         taller: the sample goes on above or below the field of a cone.
+        weights: bytes of the weights of rays that stay in memory beside line integrals.
     """
 
     method: Method
@@ -57,6 +58,7 @@ class ReconMemory:
     bars: bool = False
     radius: float | None = None
     taller: bool = False
+    weights: int = 0
 
     @property
     def rows(self) -> int:
@@ -75,7 +77,7 @@ class ReconMemory:
     def at_once(self) -> int:
         """Memory with everything in memory at once."""
         work = self._work(self.method, self.geometry, self._grid(self.rows))
-        return self.raw + self.line_integrals + max(work, self.steps.correcting, self._alone)
+        return self.raw + self.line_integrals + self.weights + max(work, self.steps.correcting, self._alone)
 
     @property
     def _alone(self) -> int:
@@ -93,7 +95,9 @@ class ReconMemory:
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)
         rays = (1 + self.weighted) * 4 * part.n_views * math.prod(part.detector_shape)
-        return rays + self._work(for_part(self.method, seen, self.rows, self.rows), part, self._grid(seen))
+        return (
+            self.weights + rays + self._work(for_part(self.method, seen, self.rows, self.rows), part, self._grid(seen))
+        )
 
     def _work(self, method: Method, geometry: Geometry, grid: Grid) -> int:
         """The method, or its error bars beside its volume."""

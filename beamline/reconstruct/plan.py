@@ -118,21 +118,25 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
         DataError: the volume does not fit, as its axis was found near an edge.
     """
     geometry = prepared.geometry
+    direct, shares = options.method.traits.direct, prepared.shares
     differ = not plan.slabs or prepared.ray_factors() is not None or prepared.shares_of is not None
-    weighted = differ and not options.method.traits.direct
+    weighted = shares is not None if direct else differ
     sample, whole = prepared.sample_radius, knows_outside(options.method.traits)
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
         radius=sample.radius if isinstance(sample, SampleRadius) else None,
         taller=whole and taller_than_field(prepared.projections.data, geometry),
+        weights=0 if shares is None else shares.nbytes * (1 + (not plan.slabs)),  # of parts of views, and of all rays
     )  # fmt: skip
-    if geometry.is_cone and (needs.radius is not None or needs.taller) and needs.at_once > plan.allowed:
+    more = "the sample goes on beyond the field" if needs.radius is not None or needs.taller else ""
+    more = more or "some pixels measured nothing, so that rays have weights" * bool(needs.weights)
+    if geometry.is_cone and more and needs.at_once > plan.allowed:
         raise DataError(
-            f"{source.path}: the sample goes on beyond the field, and the box that holds it takes "
-            f"{size(needs.at_once)} of memory by {needs.method.name}, {size(plan.allowed)} may be used. A cone is not "
-            "made in slabs. Give more --memory, or --bin 2, or fewer --rows. Nothing was written."
+            f"{source.path}: {more}, and the volume takes {size(needs.at_once)} of memory by {needs.method.name}, "
+            f"{size(plan.allowed)} may be used. A cone is not made in slabs. Give more --memory, or --bin 2, or fewer "
+            "--rows. Nothing was written."
         )
-    if plan.slabs or (needs.radius is not None and needs.at_once > plan.allowed):
+    if plan.slabs or (more and not options.method.traits.in_time and needs.at_once > plan.allowed):
         return _in_slabs(source, options, needs, plan.allowed)
     if not geometry.is_cone and prepared.axis is not None and needs.at_once > plan.allowed:
         raise DataError(
@@ -248,7 +252,7 @@ def prepare_within(
 
 def times_of(source: ScanSource, view_ids: I64, warn: Warn) -> F64:
     """[view] s when each of these views was exposed; evenly spaced in the file's order if it states no times."""
-    seconds = source.times
+    seconds = source.table.times
     if seconds is not None and np.isfinite(seconds[view_ids]).all():
         return np.asarray(seconds[view_ids], np.float64)
     period = source.attributes.get("period_s", source.attributes.get("exposure_s", 1.0))
@@ -326,7 +330,7 @@ def _refuse_file(source: ScanSource, options: ReconOptions) -> None:
     be unpacked in the memory."""
     if not (source.finished or options.unfinished):
         raise DataError(
-            f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {source.image_key.size} "
+            f"{source.path} is not finished. {next_step(source.path)} --unfinished uses the {len(source.table)} "
             "frames recorded so far. Nothing was written."
         )
     if source.unpack_bytes > (allowed := memory_of(options)):

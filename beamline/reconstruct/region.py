@@ -16,7 +16,6 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
 from beamline.storage.readers.base import ScanSource
-from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
@@ -155,7 +154,7 @@ def _widest(source: ScanSource, selection: Selection) -> int:
 
     An axis that is still to be found may stand at an edge of the detector, and so may that of a sample that jumped.
     """
-    flags = source.flags
+    flags = source.table.flags
     moved = selection.step(Preparation).judged or (flags is not None and bool(flags.flagged.any()))
     if selection.axis_col is None or moved:
         return 2 * (source.shape[1] // selection.binning)
@@ -189,7 +188,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     rows, side = rows_of(source, selection), selection.binning
     height, width = (rows.stop - rows.start) // side, source.shape[1] // side
     coarse = max(1, min(width // _COLUMNS, height))
-    every = max(1, int((source.image_key == FrameKind.PROJECTION).sum()) // _VIEWS)
+    every = max(1, source.table.views.size // _VIEWS)
     views = f"every:{every}" if selection.views == "all" else selection.views
     unlearnt = (type(step)() for step in geometry_steps(selection))
     look = replace(selection, views=views, binning=side * coarse).with_steps(*unlearnt)

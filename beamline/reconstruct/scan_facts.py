@@ -16,7 +16,7 @@ from beamline.plan.passes import ended_by
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
 from beamline.storage.flag_legend import FrameFlags, counted
-from beamline.storage.readers.base import ScanSource, rows_replaced
+from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.scan import scan_ended
 from drivers.base.frame import FrameKind
 from recon.methods import by_name
@@ -104,8 +104,8 @@ def _ranked(flags: FrameFlags, check: int, entry: FlagBit, level: Level) -> list
 def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
     from beamline.report.sheets import FlaggedFrame  # here, as it loads matplotlib
 
-    angle = float(np.degrees(source.angles[row]))
-    kind, replaces = FrameKind(int(source.image_key[row])).name.lower(), source.replaces
+    angle = float(np.degrees(source.table.angles[row]))
+    kind, replaces = source.table.kind(row).name.lower(), source.table.replaces
     if replaces is not None and (new := np.flatnonzero(replaces == row)).size:
         kind = f"replaced by {new[0]}"
     labels, regions, colour = [], [], "tab:orange"
@@ -195,11 +195,11 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     attributes = dict(source.attributes)
     sample = str(attributes.pop("sample", attributes.pop("sample_name", "")))
     columns = "" if source.cols is None else f"{source.cols[0]}:{source.cols[1]}"
-    missing, flags = int(attributes.get("missing_triggers", 0)), source.flags if flags is None else flags
+    missing, flags = int(attributes.get("missing_triggers", 0)), source.table.flags if flags is None else flags
     table = _table(source, sample or "not stated", columns)
     table["flagged by the monitor"] = "no monitor looked at it" if flags is None else counted(flags.counts())
     table |= {str(k): as_text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
-    n, again = int(source.image_key.size), rows_replaced(source)
+    n, again = len(source.table), source.table.replaced
     if again.size:
         table["views taken again"] = f"{again.size}, because of an alarm: frames {spans(again.tolist())} are not used"
     dropped = sum(int(decision.get("dropped") or 0) for decision in source.decisions)
@@ -217,7 +217,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
 
 def _table(source: ScanSource, sample: str, columns: str) -> dict[str, str]:
     """What the reader knows of a scan, by name, for people."""
-    counts = {kind: int(np.sum(source.image_key == kind)) for kind in FrameKind}
+    counts = {kind: source.table.of_kind(kind).size for kind in FrameKind}
     pitch, energy = source.pixel_size_mm, source.energy_kev
     return {
         "file": source.path.name,

@@ -29,10 +29,10 @@ from beamline.storage.parts import (
     files_with_frames,
     is_joined,
     join,
-    views_in,
     views_planned,
     wide_planned,
 )
+from beamline.storage.recorded_frames import frames_in
 from beamline.storage.recover import Recovered, recover, require_ours
 from beamline.storage.run_record import alive
 from beamline.storage.writer_lock import WriterLock
@@ -195,12 +195,12 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
                 raise DataError(f"{part} has no plan, so that its missing views are unknown. {_UNTOUCHED}")
             planned = angles
             if file[layout.COMMITTED][()]:
-                views_in(file)  # a damaged one is named
+                table = frames_in(file)  # a damaged one is named
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
                 times.append(file[layout.TIME][()])
-                views = file[layout.TRIGGER][()][file[layout.KIND][()] == FrameKind.PROJECTION]
-                retaken += int((views >= planned).sum())  # their triggers count on from those of the plan
+                numbers = table.triggers[table.views]
+                retaken += int((numbers >= planned).sum())  # which count on from those of the plan
     if not parts:
         raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
     with ExitStack() as opened, hdf5.readable(run):

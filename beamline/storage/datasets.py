@@ -18,7 +18,7 @@ from beamline.core.errors import DataError
 from beamline.core.machine import free_memory
 from beamline.core.text import NUMBER, one_line, printable, size
 from beamline.storage.hdf5 import UnreadableError, open_hdf5, reason
-from beamline.storage.packing import unpacked
+from beamline.storage.packing import PackedDataset, unpacked
 from beamline.storage.structure import drawn_on, plain_name
 
 _JOULE = 1 / 1.602176634e-16  # keV
@@ -301,8 +301,11 @@ def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None 
     Args:
         whole: which datasets are, by file and path: each is opened once, however often it is drawn on. One that draws
             on itself is not.
+
+    Raises:
+        DataError: sources whose numbers are packed, where the dataset itself does not say so.
     """
-    drawn, lost, whole = dict[tuple[str, str], list[Any]](), set(), {} if whole is None else whole
+    drawn, packed, lost, whole = dict[tuple[str, str], list[Any]](), list[str](), set(), {} if whole is None else whole
     for each in item.virtual_sources() if item.is_virtual else ():
         drawn.setdefault((plain_name(each.file_name), plain_name(each.dset_name)), []).append(each)
     for (name, where), places in drawn.items():
@@ -310,6 +313,8 @@ def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None 
         key = os.path.realpath(path), where
         with suppress(DataError, OSError), _source_file(item, name) as file:
             source = dataset(file, where)
+            if isinstance(source, PackedDataset) and not isinstance(item, PackedDataset):
+                packed.append(f"{where} in {path}")
             if source is not None and all(_holds(source, place) for place in places):
                 if key not in whole:
                     whole[key] = False
@@ -317,6 +322,12 @@ def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None 
                 if whole[key]:
                     continue
         lost.add(where if name == "." else str(path))
+    if packed:
+        raise DataError(
+            f"{item.name} in {item.file.filename} draws on {packed[0]}, whose attributes (scale_factor, ...) say that "
+            "its numbers are packed, and a virtual dataset passes them on as they are stored. Give it the same "
+            "attributes in a copy of the file, or store the values. Nothing was read."
+        )
     return sorted(lost)
 
 

@@ -1,5 +1,4 @@
-"""Volumes in a Zarr, versions 2 and 3 with any codec, by the format's library where it is installed; and the arrays of
-a Zarr or an .npy by their names, as an HDF5 file has datasets.
+"""Volumes in a Zarr, versions 2 and 3 with any codec, by the format's library where it is installed.
 
 Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; translations are left out.
 """
@@ -7,10 +6,8 @@ Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; transl
 from __future__ import annotations
 
 import math
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import require_regular
 from beamline.core.machine import free_memory
-from beamline.storage import hdf5
-from beamline.storage.packing import packing
+from beamline.storage.array_file import zarr_library
 from beamline.storage.structure import numbers_of, shape_of
 
-METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
 _MM = {"angstrom": 1e-7, "nanometer": 1e-6, "micrometer": 1e-3, "millimeter": 1.0, "centimeter": 10.0, "meter": 1e3}
 
 Spacing = tuple[float, float, float]
-
-
-def is_zarr(path: Path) -> bool:
-    """Whether a folder is a Zarr store, written by any program."""
-    return any((path / name).is_file() for name in METADATA)
 
 
 @dataclass(frozen=True)
@@ -72,17 +61,6 @@ class ZarrScale:
             return np.asarray(self.array[(*lead, *parts, *[slice(None)] * (3 - len(parts)))])
         except Exception as error:  # whatever its codecs raise for a damaged chunk
             raise DataError(f"{self.path} cannot be read ({type(error).__name__}: {error}).") from error
-
-
-def zarr_library(path: Path) -> Any:
-    """The package zarr. DataError: it is not installed."""
-    try:
-        import zarr
-    except ImportError as error:
-        raise DataError(
-            f"{path}: a Zarr needs zarr, which cannot be loaded here ({error}): pip install splatline[zarr]."
-        ) from error
-    return zarr
 
 
 def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacing | None]:
@@ -151,98 +129,3 @@ def is_halved(finest: tuple[int, ...], array: Any) -> bool:
         return False
     steps = [2 ** round(np.log2(n / m)) for n, m in zip(finest, shape, strict=True)]
     return all(m in (n // by, -(-n // by)) for n, m, by in zip(finest, shape, steps, strict=True))
-
-
-_MOST = 1000  # arrays and groups of a Zarr that are looked at
-
-
-class NamedArray:
-    """An array with what is asked of a dataset of HDF5: name, file, attrs, shape, dtype, chunks; values by slices."""
-
-    is_virtual = False
-
-    def __init__(self, array: Any, name: str, file: ArrayFile) -> None:
-        self.array, self.name, self.file, self.attrs = array, name, file, dict(getattr(array, "attrs", {}))
-        self.chunks: tuple[int, ...] | None = getattr(array, "chunks", None)
-        packed = None
-        if array.dtype.kind in "uif":
-            packed = packing(self.attrs, array.dtype, f"{name} in {file.filename}", by_cil=False)
-        self._values, self.dtype = (
-            packed or np.asarray,
-            np.result_type(array.dtype, np.float32) if packed else array.dtype,
-        )
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.array, name)
-
-    def __getitem__(self, part: Any) -> Any:
-        try:
-            return self._values(self.array[part])
-        except Exception as error:  # whatever the codecs of a Zarr raise for a damaged chunk
-            raise OSError(f"{type(error).__name__}: {error}") from error
-
-
-class ArrayFile(dict[str, NamedArray]):
-    """The arrays of a file by the paths of their names; "" is the only one of a file."""
-
-    def __init__(self, path: Path) -> None:
-        self.filename, self.attrs, self.close = str(path), dict[str, Any](), lambda: None
-        if path.suffix.lower() == _NUMPY:
-            require_regular(path)
-            arrays: dict[str, Any] = {"": np.load(path, mmap_mode="r", allow_pickle=False)}
-        else:
-            zarr, store = zarr_library(path), str(path)
-            if path.is_file():
-                store = zarr.storage.ZipStore(path, mode="r")
-                self.close = store.close
-            root = zarr.open(store=store, path=zarr_root(path) or "", mode="r")
-            members = [("", root)] if hasattr(root, "chunks") else islice(root.members(max_depth=None), _MOST)
-            arrays, self.attrs = {name: item for name, item in members if hasattr(item, "chunks")}, dict(root.attrs)
-        self.update({name: NamedArray(array, f"/{name}", self) for name, array in arrays.items()})
-
-    def __missing__(self, path: str) -> NamedArray:
-        name = path.strip("/")
-        if name not in self and (name or len(self) != 1):
-            raise KeyError(path)
-        return self.get(name) or next(iter(self.values()))
-
-
-def open_array_file(path: Path, follow: bool = False) -> Any:
-    """Open a file that has arrays by their names: HDF5, which may still grow, or `ArrayFile`."""
-    return ArrayFile(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
-
-
-_NUMPY = ".npy"
-_RUNS = (
-    "{0} is a pickle, which is never opened here: it may run any program that its writer put into it. If you trust the "
-    'writer, convert FILE (as NAF and SAX-NeRF have it): python -c "import numpy as np, pickle; d = pickle.load(open('
-    "'FILE', 'rb')); np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
-    'print({k: v for k, v in d.items() if np.size(v) < 9})". It prints DSO, DSD and dDetector in mm. Then: beamline '
-    "recon views.npy --angles angles.npy --angles-unit rad --quantity line-integrals --cone DSO:DSD --pixel-size-um "
-    "1000*dDetector. Nothing was read."
-)
-_PACKED = (
-    '{0} holds arrays saved by Python, which are read from an .npy: python -c "import numpy as np; d = np.load('
-    "'FILE'); [np.save(n + '.npy', d[n]) for n in d.files]; print(d.files)\" writes one for each. `beamline view` "
-    "shows a volume of an .npz. Nothing was read."
-)
-_CONVERTED = {".npz": _PACKED, **dict.fromkeys((".pickle", ".pkl", ".pck"), _RUNS)}
-"""How files that are not read become some that are, by suffix."""
-
-
-def holds_arrays(path: Path) -> bool:
-    """Whether a path is an .npy, or a Zarr. DataError: a file whose arrays are read once they are converted."""
-    if path.is_file() and (way := _CONVERTED.get(path.suffix.lower())):
-        raise DataError(way.replace("{0}", str(path)))
-    return (path.suffix.lower() == _NUMPY and path.is_file()) or zarr_root(path) is not None
-
-
-def zarr_root(path: Path) -> str | None:
-    """Where in a folder or .zip a Zarr begins; None without one."""
-    if path.is_dir():
-        return "" if is_zarr(path) else None
-    if path.suffix.lower() != ".zip" or not path.is_file() or not zipfile.is_zipfile(path):
-        return None
-    with zipfile.ZipFile(path) as packed:
-        names = [name.rpartition("/") for name in packed.namelist()]
-    return min((folder for folder, _, name in names if name in METADATA), key=len, default=None)

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import struct
+import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
@@ -165,7 +166,7 @@ def is_hdf5(path: Path, follow: bool = False) -> bool:
 
 ALTERED = (
     *(OSError, RuntimeError, LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError),
-    *(EOFError, MemoryError, struct.error, zlib.error),
+    *(EOFError, MemoryError, struct.error, zlib.error, zipfile.BadZipFile),
 )
 """What libraries raise where a file is damaged, or holds other things than its names promise; none of ours is among
 them."""

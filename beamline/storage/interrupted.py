@@ -20,16 +20,14 @@ from beamline.plan.passes import Choice, Passes, passes_at_start, triggers_to_ta
 from beamline.plan.plan import Block, Mode
 from beamline.storage import hdf5
 from beamline.storage.parts import (
-    decisions_in,
     files_with_frames,
     joined_file_of,
-    pass_ends_in,
     plan_in,
     to_join,
-    views_in,
     views_planned,
     wide_planned,
 )
+from beamline.storage.recorded_frames import decisions_in, frames_in
 from beamline.storage.run_record import DIED, alive, read_record
 from beamline.storage.superblock import marked_as_being_written, superblock
 from beamline.storage.writer_lock import QUIET, abandoned, held
@@ -162,8 +160,9 @@ def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str
     """
     views, since_pass_end, chosen, n_ended = set[int](), set[int](), dict[str, str](), 0
     for file in files:
-        ends, taken = pass_ends_in(file), views_in(file)
-        since_pass_end = {*views_in(file, int(ends[-1]))} if ends.size else since_pass_end | taken
+        table = frames_in(file)
+        ends, taken = table.pass_ends, table.numbers_taken()
+        since_pass_end = {*table.numbers_taken(int(ends[-1]))} if ends.size else since_pass_end | taken
         views, n_ended = views | taken, n_ended + ends.size
         chosen |= {str(values.get("number")): values["choice"] for values in decisions_in(file) if "choice" in values}
     if layout.PASS_ENDS not in files[0]:
@@ -185,8 +184,8 @@ def n_still_to_take(file: h5py.File) -> int | None:
 
 
 def wide_taken(files: Sequence[h5py.File]) -> frozenset[int]:
-    """Triggers of the wide views in the files of a scan, as of `views_in`."""
-    return frozenset[int]().union(*(views_in(file, kind=FrameKind.ALIGNMENT) for file in files))  # written as such
+    """Triggers of the wide views in the files of a scan."""
+    return frozenset[int]().union(*(frames_in(file).numbers_taken(kind=FrameKind.WIDE_VIEW) for file in files))
 
 
 def _passes_of(file: h5py.File, choices: Iterable[str]) -> Passes:

@@ -59,8 +59,8 @@ def packing(
     """
     real = np.result_type(dtype, np.float32)
     pair = _CIL if dtype.kind in "ui" and {*_CIL} <= {*attributes} and not {*_CF} & {*attributes} else _CF
-    pair_values = [np.ravel(attributes.get(name, plain))[:1] for name, plain in zip(pair, (1, 0), strict=True)]
-    scale, offset = (float(each[0]) if each.size and each.dtype.kind in "uif" else np.nan for each in pair_values)
+    pair_values = [np.ravel(attributes.get(name, plain)) for name, plain in zip(pair, (1, 0), strict=True)]
+    scale, offset = (float(each[0]) if each.size == 1 and each.dtype.kind in "uif" else np.nan for each in pair_values)
     if not (scale and np.isfinite(scale + offset)) or (pair is _CIL and not by_cil and (scale, offset) != (1, 0)):
         shown = " and ".join(
             f"{name} {printable(str(each))[1:40].strip(']')}" for name, each in zip(pair, pair_values, strict=True)

@@ -24,14 +24,13 @@ from beamline.core.files import EVENTS, JOINED, SCAN, open_below, parts_of, run_
 from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
 from beamline.storage import datasets, hdf5
+from beamline.storage.frame_table import FrameTable
+from beamline.storage.recorded_frames import altered_rows, frames_in, pass_ends_in, record_checksums
 from beamline.storage.superblock import superblock
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import (
     add_exchange_view,
-    altered_rows,
     ending_in,
-    record_checksums,
-    require_earlier,
     state_ending,
 )
 from drivers.base.frame import FrameKind
@@ -39,49 +38,6 @@ from drivers.base.frame import FrameKind
 _VIRTUAL = (layout.DATA, layout.PREVIEW)
 _READINGS = (f"{layout.BEAM}/time", f"{layout.BEAM}/value")
 _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
-
-
-def views_in(file: h5py.File, first: int = 0, kind: FrameKind = FrameKind.PROJECTION) -> frozenset[int]:
-    """The planned views in a file, counted from 0, except those whose frame is invalid, or whose record differs from
-    its checksum.
-
-    Args:
-        first: the row from which on frames count.
-        kind: of these frames.
-
-    Raises:
-        ValueError: a row claims to replace a later one.
-    """
-    n = int(file[layout.COMMITTED][()])
-    triggers, replaces, kinds = (file[path][:n] for path in (layout.TRIGGER, layout.REPLACES, layout.KIND))
-    altered = altered_rows(file, 0, n)
-    replaces[altered], kinds[altered] = -1, FrameKind.INVALID
-    require_earlier(replaces)
-    views = set()
-    for row in first + np.flatnonzero(kinds[first:] == kind):
-        while replaces[row] >= 0:  # a view that was taken again has the number of the first one
-            row = replaces[row]
-        views.add(int(triggers[row]))
-    return frozenset(views)
-
-
-def pass_ends_in(file: h5py.File) -> NDArray[np.int64]:
-    """Rows of a file at the end of each pass [pass], of those committed; empty where the scan chose nothing."""
-    ends = np.asarray(_list_in(file, layout.PASS_ENDS), np.int64)
-    return ends[ends <= int(file[layout.COMMITTED][()])] if ends.size else ends
-
-
-def decisions_in(file: h5py.File) -> tuple[dict[str, Any], ...]:
-    """What was chosen after each pass, oldest first: values of the event `next_chosen`; empty likewise."""
-    return tuple(json_object(datasets.text(line)) or {} for line in _list_in(file, layout.DECISIONS))
-
-
-def _list_in(file: h5py.File, path: str) -> Sequence[Any]:
-    """The values of a dataset, also of one that grows; none where the file does not have it."""
-    if path not in file:
-        return ()
-    hdf5.look_again(file[path])
-    return file[path][()]
 
 
 def views_planned(file: h5py.File) -> int | None:
@@ -106,14 +62,13 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
 
     None of a later part of a run, which takes what the parts before lack, and of files without their plan.
     """
-    n = int(file[layout.COMMITTED][()])
-    kinds, triggers = file[layout.KIND][:n], file[layout.TRIGGER][:n]
-    views = np.flatnonzero(kinds == FrameKind.PROJECTION)
+    table = frames_in(file)
+    views = table.views
     if not views.size or views_planned(file) is None or run_of(path.resolve().parent) != path.resolve().parent:
         return ()
-    before = np.isin(kinds[: views[0]], (FrameKind.DARK, FrameKind.FLAT))
-    first = np.flatnonzero(before)[-1] + 1 if before.any() else 0
-    seen = triggers[first : views[-1] + 1]
+    references = table.of_kind(FrameKind.DARK, FrameKind.FLAT)
+    first = references[references < views[0]].max(initial=-1) + 1
+    seen = table.triggers[first : views[-1] + 1]
     seen = seen[seen < (views_planned(file) or 0)]  # wide views, and those taken again, count on from there
     gaps = np.setdiff1d(np.arange(seen.max(initial=0)), seen)
     return tuple((sum(_planned(file, "start").values()) + gaps).tolist())
@@ -139,17 +94,10 @@ def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
 
 def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
     """Triggers, counted within their block, of the references after the last view of all files."""
-    rows = [int(file[layout.COMMITTED][()]) for file in files]
-    kinds, triggers = (
-        np.concatenate([file[path][:n] for file, n in zip(files, rows, strict=True)])
-        for path in (layout.KIND, layout.TRIGGER)
-    )
-    views = np.flatnonzero(kinds == FrameKind.PROJECTION)
-    firsts = np.cumsum([0, *rows])
-    for file, first, n in zip(files, firsts, rows, strict=False):
-        kinds[first + altered_rows(file, 0, n)] = FrameKind.INVALID
-    after = np.arange(kinds.size) > (views[-1] if views.size else kinds.size)
-    return {kind: set(triggers[after & (kinds == kind)].tolist()) for kind in (FrameKind.FLAT, FrameKind.DARK)}
+    table = FrameTable.concat([frames_in(file) for file in files])
+    after = table.views[-1] if table.views.size else len(table)
+    rows = {kind: table.of_kind(kind) for kind in (FrameKind.FLAT, FrameKind.DARK)}
+    return {kind: set(table.triggers[some[some > after]].tolist()) for kind, some in rows.items()}
 
 
 def join(parts: Sequence[Path], joined: Path) -> int:
@@ -262,7 +210,7 @@ def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -
     values = {path: [file[path][:n] for file, n in zip(files, rows, strict=True)] for path in grown}
     for i, (file, n, first) in enumerate(zip(files, rows, firsts[:-1], strict=True)):
         record = {path: values[path][i] for path in layout.RECORDED}
-        again = np.setdiff1d(np.flatnonzero(record[layout.REPLACES] >= 0), altered_rows(file, 0, n))
+        again = np.setdiff1d(np.flatnonzero(record[layout.REPLACES] >= 0), altered_rows(file, n))
         record[layout.REPLACES][again] += first
         values[layout.RECORD_CHECKSUM][i][again] = record_checksums(record)[again]
     values |= {path: [file[path][()] for file in files] for path in _READINGS if path in files[-1]}
@@ -348,7 +296,7 @@ def _copy(source: h5py.Group, target: h5py.Group, values: dict[str, NDArray[Any]
 def _missing(files: Sequence[h5py.File]) -> tuple[int, ...]:
     """Triggers that gave no frame, in a later part either."""
     before = sum(_planned(files[0], "start").values())
-    stored = {before + view for file in files for view in views_in(file)}
+    stored = {before + view for file in files for view in frames_in(file).numbers_taken()}
     taken, first = _after_views(files), before + (views_planned(files[0]) or 0)
     for kind, n in _planned(files[0], "end").items():
         stored |= {first + trigger for trigger in taken[kind]}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import re
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,6 +16,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import text_in, write_whole
 from beamline.core.text import csv_text
 from beamline.storage import datasets, hdf5
+from beamline.storage.array_file import numpy_arrays
 from beamline.storage.readers.nexus import choose, find
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import opened_reconstruction
@@ -180,14 +180,11 @@ def _require_keys(path: Path, columns: dict[str, F64], by: Key) -> None:
 
 def _of_arrays(path: Path) -> PoseTable:
     """Vectors of all views, in an .npz under the name that ASTRA has for their kind."""
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            read = {name: np.asarray(arrays[name]) for name in arrays.files if name in _ARRAYS}
-            names = arrays.files
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise ValueError(f"{path} cannot be read ({error})") from error
+    with hdf5.readable(path):
+        arrays = numpy_arrays(path)
+    read = {name: values for name, values in arrays.items() if name in _ARRAYS}
     if len(read) != 1:
-        raise ValueError(f"{path} holds {', '.join(names)}; expected one of {' and '.join(_ARRAYS)}")
+        raise ValueError(f"{path} holds {', '.join(arrays)}; expected one of {' and '.join(_ARRAYS)}")
     ((name, vectors),) = read.items()
     if vectors.dtype.kind not in "iuf" or vectors.ndim != 2:
         raise ValueError(f"{path}: {name} is {vectors.dtype} of shape {vectors.shape}; expected numbers [view, 12]")

@@ -23,6 +23,7 @@ from beamline.storage import hdf5
 from beamline.storage.disk_file import GrowingFile
 from beamline.storage.interrupted import n_still_to_take
 from beamline.storage.parts import copy_rows, gaps_in, is_whole, require_joined, views_planned
+from beamline.storage.recorded_frames import altered_rows
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WriterLock, held
@@ -31,7 +32,6 @@ from beamline.storage.writers.rows import (
     DIED,
     RUNNING,
     ScanEnding,
-    altered_rows,
     ending_in,
     has_exchange_view,
     put_exchange_view,
@@ -139,7 +139,7 @@ def _with_view(path: Path, head: Superblock) -> Recovered:
         require_ours(path, file)
         require_joined(file)
         frames, complete = int(file[layout.COMMITTED][()]), has_exchange_view(file)
-        altered = tuple(altered_rows(file, 0, frames).tolist())
+        altered = tuple(altered_rows(file, frames).tolist())
     if not complete:
         put_exchange_view(path)
     return Recovered(path, not complete, frames, 0, None, altered=altered)
@@ -169,7 +169,7 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
                 planned, dropped = views_planned(made), max(0, len(file[layout.DATA]) - committed)
                 alone = planned is not None and run_of(path.resolve().parent) == path.resolve().parent
                 missing = n_still_to_take(made) if alone else None
-                altered = tuple(altered_rows(made, 0, frames).tolist())
+                altered = tuple(altered_rows(made, frames).tolist())
     except hdf5.ALTERED as error:
         if isinstance(error, OSError) and error.filename == str(target):
             raise
@@ -196,7 +196,7 @@ def _frames_there(file: h5py.File) -> int:
     n = min(int(file[layout.COMMITTED][()]), len(file[layout.DATA]), len(file[layout.PREVIEW]))
     for path in layout.growing(file):
         n = _most_rows(file[path], n)
-    good = np.setdiff1d(np.arange(n), altered_rows(file, 0, n))[::-1].tolist()
+    good = np.setdiff1d(np.arange(n), altered_rows(file, n))[::-1].tolist()
     return next((row + 1 for row in good if is_whole(file, row)), 0)
 
 

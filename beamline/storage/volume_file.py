@@ -15,11 +15,10 @@ from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
 from beamline.core.files import RECON, no_file, refuse_substitute, require_regular
-from beamline.core.machine import free_memory
 from beamline.storage import datasets, hdf5
-from beamline.storage.foreign_zarr import is_zarr, open_zarr
+from beamline.storage.array_file import is_zarr, numpy_arrays, require_room
+from beamline.storage.foreign_zarr import open_zarr
 from beamline.storage.readers.tiff import require_possible
-from beamline.storage.structure import require_npy
 
 LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
 """mm of a metre, a millimetre and a micrometre, by NIfTI's xyzt_units; an unstated unit counts as mm."""
@@ -40,7 +39,7 @@ def read_volume(
     name = path.name.lower()
     if is_zarr(path):
         scale, spacing = open_zarr(path, dataset)
-        _check_size(path, math.prod(scale.shape) * scale.dtype.itemsize)
+        require_room(path, math.prod(scale.shape) * scale.dtype.itemsize)
         return scale[:], spacing
     if path.is_dir():
         return _from_folder(path), None
@@ -95,7 +94,7 @@ def _from_tiff(path: Path) -> NDArray[np.generic]:
     with tifffile.TiffFile(path) as tif:
         require_possible(tif)
         series = tif.series[0]
-        _check_size(path, math.prod(series.shape) * np.dtype(series.dtype).itemsize)
+        require_room(path, math.prod(series.shape) * np.dtype(series.dtype).itemsize)
         return tif.asarray()
 
 
@@ -121,7 +120,7 @@ def _from_folder(path: Path) -> NDArray[np.generic]:
         except Exception as error:  # as of other foreign files
             raise DataError(f"{path / name} cannot be read ({type(error).__name__}: {error}).") from error
         if slices is None:
-            _check_size(path, values.nbytes * len(files))
+            require_room(path, values.nbytes * len(files))
             slices = np.empty((len(files), *values.shape), values.dtype)
         if values.ndim != 2 or (values.shape, values.dtype) != (slices.shape[1:], slices.dtype):
             raise DataError(
@@ -131,16 +130,6 @@ def _from_folder(path: Path) -> NDArray[np.generic]:
         slices[z] = values
     assert slices is not None
     return slices
-
-
-def _check_size(path: Path, n: int) -> None:
-    """Raises DataError if n bytes exceed the free memory: a damaged file may claim any size."""
-    free = free_memory()
-    if n > free:
-        raise DataError(
-            f"{path} cannot be read: it says that it holds {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are "
-            "free; cut the volume or bin it."
-        )
 
 
 def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float]]:
@@ -162,7 +151,7 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
         raise DataError(f"{path} holds {dtype} of shape {shape}; expected real numbers of three axes.")
     if unit is None or not (np.isfinite(steps).all() and steps.all()):
         raise DataError(f"{path} states voxels of {steps} in the unit {image.header['xyzt_units']}; expected lengths.")
-    _check_size(path, math.prod(shape) * dtype.itemsize)
+    require_room(path, math.prod(shape) * dtype.itemsize)
     values = np.asarray(image.dataobj).T.reshape(shape[2::-1])  # [x, y, z], then any axes of length 1
     x, y, z = (float(step) * unit for step in steps)
     scaled = values.dtype.newbyteorder("=") != dtype.newbyteorder("=")
@@ -170,16 +159,9 @@ def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, fl
 
 
 def _from_numpy(path: Path, name: str | None) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
-    with path.open("rb") as file:  # opened here, for numpy leaves a damaged archive open
-        if file.peek(1)[:1] == b"\x93":
-            require_npy(file)
-        loaded = np.load(file, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return loaded, None
-        with loaded:
-            members = [member for member in loaded.zip.infolist() if member.filename.endswith(".npy")]
-            _check_size(path, sum(member.file_size for member in members))
-            arrays = {key: loaded[key] for key in (member.filename.removesuffix(".npy") for member in members)}
+    arrays = numpy_arrays(path)
+    if "" in arrays:
+        return arrays[""], None
     name = _only(path, {key: array.ndim for key, array in arrays.items()}) if name is None else name
     if name not in arrays:
         raise DataError(f"{path} has no array {name!r}; it has {', '.join(arrays)}.")
@@ -204,7 +186,7 @@ def _from_hdf5(
     item = file.get(name)
     if not isinstance(item, h5py.Dataset):
         raise DataError(f"{path} has no dataset {name!r}.")
-    _check_size(path, item.nbytes)
+    require_room(path, item.nbytes)
     return datasets.read_part(item, ()), axes_of(file, name)[0]
 
 

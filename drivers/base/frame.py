@@ -25,7 +25,7 @@ class Frame:
     """One image with its metadata. It owns its memory, which is the only copy made of the camera's ring buffer.
 
     Attributes:
-        counts: uint16 [row, col].
+        counts: [row, col], uint16 of a camera; those of a file may be of another type.
         kind: projection, flat, dark, ...
         index: row in the file, counted over all frames of the scan from 0.
         trigger: index of the trigger pulse that exposed it, counted within its block of frames from 0.

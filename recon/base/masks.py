@@ -12,10 +12,11 @@ import scipy
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, Mask, some_values
+from recon.base.jit import njit
 
 Image = NDArray[np.float32]
-NEIGHBOURS = np.array([(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)])
-Fill = list[tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Mask]]
+Fill = tuple[NDArray[np.int32], NDArray[np.intp], NDArray[np.intp]]
+"""The ring [row, col] of each masked pixel, counted from outside; 0: not masked; and rows and columns, ring by ring."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,23 +39,12 @@ def plan_fill(mask: Mask) -> Fill:
     Raises:
         ValueError: all pixels [row, col] are masked.
     """
-    rows, cols = mask.shape
-    known, left = ~mask, int(np.count_nonzero(mask))
+    if mask.all():
+        raise ValueError(f"all {mask.size} pixels are masked or not finite: there is nothing to fill them from")
+    ring = scipy.ndimage.distance_transform_cdt(mask, "chessboard")
     r, c = np.nonzero(mask)
-    plan: Fill = []
-    while left:
-        nr, nc = r[:, None] + NEIGHBOURS[:, 0], c[:, None] + NEIGHBOURS[:, 1]
-        inside = (nr >= 0) & (nr < rows) & (nc >= 0) & (nc < cols)
-        nr, nc = np.clip(nr, 0, rows - 1), np.clip(nc, 0, cols - 1)
-        valid = inside & known[nr, nc]
-        ready = valid.any(axis=1)
-        if not ready.any():
-            raise ValueError(f"all {mask.size} pixels are masked or not finite: there is nothing to fill them from")
-        plan.append((r[ready], c[ready], nr[ready], nc[ready], valid[ready]))
-        known[r[ready], c[ready]], left = True, left - int(ready.sum())
-        beside = inside[ready] & ~known[nr[ready], nc[ready]]  # the next ring
-        r, c = np.divmod(np.unique((nr[ready] * cols + nc[ready])[beside]), cols)
-    return plan
+    order = np.argsort(ring[r, c], kind="stable")
+    return ring, r[order], c[order]
 
 
 def areas(mask: Mask) -> Mask:
@@ -68,8 +58,30 @@ def areas(mask: Mask) -> Mask:
 
 def fill(image: Image, plan: Fill) -> None:
     """Fill the masked pixels of `plan` (see `plan_fill`), in place."""
-    for r, c, nr, nc, valid in plan:
-        image[r, c] = np.where(valid, image[nr, nc], 0).sum(axis=1) / valid.sum(axis=1)
+    filled = np.ascontiguousarray(image)
+    _fill(filled, *plan)
+    if filled is not image:
+        image[...] = filled
+
+
+@njit(nogil=True, cache=True)
+def _fill(image, ring, r, c):  # type: ignore[no-untyped-def]
+    """Fill pixels in this order, each with the mean of its neighbours in rings further out."""
+    rows, cols = image.shape
+    near = np.zeros(8, np.float32)
+    for i in range(r.size):
+        known, at = 0, 0
+        for row in range(r[i] - 1, r[i] + 2):
+            for col in range(c[i] - 1, c[i] + 2):
+                if row == r[i] and col == c[i]:
+                    continue
+                near[at] = 0
+                if 0 <= row < rows and 0 <= col < cols and ring[row, col] < ring[r[i], c[i]]:
+                    near[at] = image[row, col]
+                    known += 1
+                at += 1
+        sums = (near[0] + near[1]) + (near[2] + near[3]), (near[4] + near[5]) + (near[6] + near[7])
+        image[r[i], c[i]] = (sums[0] + sums[1]) / known
 
 
 def masked(

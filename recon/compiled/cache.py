@@ -24,7 +24,6 @@ from typing import IO, Any
 
 import llvmlite.binding as llvm
 from numba.core import caching
-from numba.core.compiler_lock import global_compiler_lock
 from numba.np.ufunc import parallel
 
 from recon.compiled.archive import carried, sealed, unsealed
@@ -139,16 +138,13 @@ def _launch_threads() -> None:
     _loops.append(llvm.create_mcjit_compiler(loop, llvm.Target.from_default_triple().create_target_machine()))
     llvm.add_symbol("numba_parallel_for", _loops[0].get_function_address("run"))
     if sys.platform != "win32":  # which has no forks
-        # A kernel that another thread compiles is finished before the fork: its lock would stay locked in the child.
-        lock = global_compiler_lock
-        os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=_forked)
+        os.register_at_fork(after_in_child=_forked)
 
 
 def _forked() -> None:
-    global_compiler_lock.release()
     torch: Any = sys.modules.get("torch")
     if hasattr(torch, "set_num_threads"):
-        torch.set_num_threads(1)  # its OpenMP would wait, too
+        torch.set_num_threads(1)  # its OpenMP would wait for its threads
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows

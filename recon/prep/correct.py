@@ -27,7 +27,7 @@ from recon.prep.references import (
 )
 from recon.prep.spots import SpotFilter
 from recon.prep.spots import Transmission as Transmission
-from recon.prep.unmeasured import DARK, NO_RUNS, runs_of, unmeasured
+from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
 
 _NOISY = 0.01  # of the line integrals of a view are below 0, where air has noise
 _DEEPEST = 60.0  # line integral: e^-60 is no light, and squares of e^60 are numbers
@@ -85,6 +85,7 @@ class Projections:
             pixels; None: photons were not counted.
         unmeasured: int64 [run, 4], pixels that measured nothing in a view, filled from their neighbours: the view's
             number, row, first column, column after the last.
+        left: pixels of spots that were too large to be filled, in these views and those before.
     """
 
     data: NDArray[np.float32]
@@ -96,6 +97,16 @@ class Projections:
     replaced: float = 0.0
     weights: NDArray[np.float32] | None = None
     unmeasured: I64 = field(default_factory=NO_RUNS.copy)
+    left: int = 0
+
+    @property
+    def lit(self) -> Mask | None:
+        """bool [view, row, col], pixels that measured something; None: all, but for lines, which are interpolated."""
+        lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
+        at = {int(view): number for number, view in enumerate(self.view_ids)}
+        for view, row, first, end in self.unmeasured[np.isin(self.unmeasured[:, 0], self.view_ids)].tolist():
+            lit[at[view], row, first:end] = False
+        return None if lit.all() else lit
 
 
 class Correction:
@@ -269,7 +280,8 @@ class Correction:
             np.negative(np.log(view, out=view), out=view)
         live = max(int((~self.masked).sum()) * len(views.data), 1)
         lines, replaced = (views.data, views.view_ids, floored / live), int(views.repaired.sum()) / live
-        return Projections(*lines, views.air, self.masked, columns, replaced, views.beam, views.unmeasured)
+        found = self.masked, columns, replaced, views.beam, views.unmeasured, self.spots.left
+        return Projections(*lines, views.air, *found)
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
@@ -320,7 +332,7 @@ class LineIntegralCorrection:
         bad, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
         hidden = np.zeros(data.shape[1:], np.bool_)
         for v, view in enumerate(data):
-            light = DARK * (2 + view / np.float32(np.log(DARK)))  # above DARK where transmission is
+            light = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
             light[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
             lost = bad[v]
             if (unseen := unmeasured(view, light, hidden, self._foreign)) is not None:
@@ -349,9 +361,8 @@ class LineIntegralCorrection:
             views = Transmission(none, empty, empty, np.empty(0, np.float32))
         views = self.spots.feed(views, last, progress, order)
         replaced = float(views.repaired.sum()) / max(views.data.size, 1)
-        return Projections(
-            views.data, views.view_ids, 0.0, views.air, self.masked, replaced=replaced, unmeasured=views.unmeasured
-        )
+        found = self.masked, (0, 0), replaced, None, views.unmeasured, self.spots.left
+        return Projections(views.data, views.view_ids, 0.0, views.air, *found)
 
 
 def provisional(correction: Correction | LineIntegralCorrection) -> Projections | None:
@@ -391,7 +402,7 @@ def correct(
 def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None = None) -> Projections:
     """Join batches of a scan's views. The list is emptied meanwhile, so that only few views are in memory twice.
 
-    The air columns and the mask are those of the last batch.
+    The air columns, the mask and the spots left are those of the last batch.
 
     Args:
         data: the line integrals of all, if they are together already; those of the batches do not count then.
@@ -410,4 +421,4 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
             part = parts.pop(0).data
             data[at : at + len(part)] = part
             at += len(part)
-    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs)
+    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs, last.left)

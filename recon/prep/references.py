@@ -17,6 +17,8 @@ from recon.base.declared_types import check_settings
 from recon.base.masks import Image
 from recon.base.noise import deviation_between_neighbours
 from recon.prep.dynamic_flats import DynamicFlats
+from recon.prep.spots import without_spots
+from recon.prep.unmeasured import with_rim
 
 Kept = TypeVar("Kept", F32, F64)
 
@@ -25,7 +27,7 @@ Kept = TypeVar("Kept", F32, F64)
 class References:
     """Darks and flats: the images without beam, and with beam but without a sample.
 
-    A stack of frames [frame, row, col], any real type, is replaced by its mean.
+    A stack of frames [frame, row, col], any real type, is replaced by its mean without bright spots of single frames.
 
     Attributes:
         dark: float32 [row, col], mean or median of the darks; or all darks, as a stack.
@@ -42,9 +44,11 @@ class References:
     part_starts: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "dark", _mean(self.dark, "darks"))
+        some = np.ma.filled(self.flats[0][1], 0) if self.flats else np.zeros(0)
+        light = float(np.nanpercentile(some, _BRIGHT)) if np.size(some) else 0.0
+        object.__setattr__(self, "dark", _mean(self.dark, "darks", light))
         check_settings(self)
-        flats = tuple((position, _mean(flat, f"flats at {position:g}")) for position, flat in self.flats)
+        flats = tuple((position, _mean(flat, f"flats at {position:g}", light)) for position, flat in self.flats)
         object.__setattr__(self, "flats", flats)
 
     def rows(self, rows: slice) -> References:
@@ -54,12 +58,14 @@ class References:
         return replace(self, dark=self.dark[rows], flats=flats, dynamic=dynamic)
 
 
-def _mean(frames: Image, what: str) -> Image:
+def _mean(frames: Image, what: str, light: float) -> Image:
     """The mean of a stack, or an image as it is; NaN where all is masked."""
     if np.ndim(frames) != 3:
         return cast(Image, without_mask(frames))
     if not len(frames):
         raise ValueError(f"the stack of {what} is empty: expected [frame, row, col] with at least one frame")
+    if not np.ma.is_masked(frames):
+        frames = np.stack([frame for frame, _ in without_spots(without_mask(frames), light)])
     return np.asarray(without_mask(np.mean(frames, axis=0, dtype=np.float64)), np.float32)
 
 
@@ -107,6 +113,7 @@ _DIM, _SURE = 0.05, 3.0  # of the light that no view reaches in a shadow, and st
 SHADOW_REACH = 5  # Rows and columns around a pixel that decide whether it lies in a shadow, beside its own row
 _WHOLE = 0.9  # of the pixels of a row: noise lights some
 _UNLIT = 0.01  # of the light on well-lit pixels: below it a pixel is unlit
+_BRIGHT = 90.0  # percentile of a flat that is in the beam
 
 
 def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0) -> Mask:
@@ -125,7 +132,7 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
             f"median dark {np.median(dark):.4g}): no beam in the flats, or darks and flats exchanged"
         )
     # Behind a slit, flat and view are both noise, and their ratio has no meaning.
-    dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], 90) for net in nets)])
+    dead = np.logical_or.reduce([dead, *(net < _UNLIT * np.percentile(net[~dead], _BRIGHT) for net in nets)])
     response = np.median([np.median(net[~dead]) for net in nets])
 
     def outliers(image: Image, least: float) -> Mask:
@@ -146,7 +153,8 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
 
     Only runs of dark pixels from an edge of their row count, and rows that are dark as a whole. An opaque rod on the
     rotation axis darkens the middle, which does not count. Opaque matter that covers an edge in all views counts: its
-    line integrals are not measured either way. Two pixels beside an area belong to it: its blurred edge.
+    line integrals are not measured either way. Its blurred edge belongs to it, see
+    `with_rim`.
 
     Args:
         light: float32 [view, row, col], transmission of views all around, three at least.
@@ -156,13 +164,14 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     middle = np.median(light, axis=0)
     spread = np.median(np.abs(light - middle), axis=0) / MEDIAN
     dark = middle < np.maximum(floor, _SURE * spread / np.sqrt(n))
-    dark &= np.partition(light, n - 2, axis=0)[n - 2] < _DIM  # one view may have a zinger
+    bright = np.partition(light, n - 2, axis=0)[n - 2]  # one view may have a zinger
+    dark &= bright < _DIM
     whole = dark.mean(axis=1) > _WHOLE  # a row that is not read has no blurred edge
     block = np.ones((3, 3))
     dark = ndimage.binary_opening(ndimage.binary_closing(np.pad(dark, 2, mode="edge"), block), block)[2:-2, 2:-2]
     left, right = (np.logical_and.accumulate(side, axis=1) for side in (dark, dark[:, ::-1]))
     found = left | right[:, ::-1]
-    return np.asarray(ndimage.binary_dilation(found, np.ones((5, 5))) | whole[:, None])
+    return with_rim(found, bright) | whole[:, None]
 
 
 _NEXT, _OUTER = 5, 3  # views next to flats; columns

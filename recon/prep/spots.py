@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32, I64, Mask
+from recon.base.arrays import F32, I64, MEDIAN, Mask
 from recon.base.jit import njit
 from recon.base.masks import Image, fill, plan_fill
-from recon.base.noise import deviation_between_neighbours
-from recon.prep.unmeasured import NO_RUNS
+from recon.prep.unmeasured import DARK, NO_RUNS
 
 _LEAST = 0.005  # least noise of √light, of that of the open beam: 1 % of its light, as grain of screen and optics
 _WIDEST = 3  # pixels of a spot along rows and columns
 _AROUND = 3  # pixels on each side of a spot that show how much the views differ there
-_NOISE_ROWS = 64  # about, that show the noise of a view
-_MEDIAN = 0.954  # of |x - y|, for normal variables of standard deviation 1
+_SAMPLE, _FEWEST = 600, 30  # pixels, about, that show the noise of a view, and whether its light has changed
+_OPAQUE = DARK**0.5  # √light, below which matter shows nothing of a gap that opens in it
+_OF_REFERENCES = 8.0  # standard deviations, by which spots of darks and flats are brighter
+_MEDIAN = MEDIAN * 2**0.5  # of |x - y|, for normal variables of standard deviation 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,9 @@ class SpotFilter:
     """Fills spots of views that come in batches of any size, each view between its neighbours in angle or time.
 
     The newest view waits for the next one. The result is the same to the bit for any split into batches.
+
+    Attributes:
+        left: pixels of spots that were too large to be filled, in all views so far.
     """
 
     def __init__(self, threshold: float, root: Callable[[F32], F32]) -> None:
@@ -71,6 +75,7 @@ class SpotFilter:
         self._threshold, self._root = threshold, root
         self._before: Image | None = None  # the last view that was freed of spots, as `root` reads it
         self._waiting: Transmission | None = None
+        self.left = 0
 
     @property
     def waiting(self) -> bool:
@@ -98,7 +103,8 @@ class SpotFilter:
         for done, view in enumerate(order[:n], 1):
             after = self._root(views.data[order[done]]) if done < total else None
             if here is not None and np.isfinite(self._threshold):
-                found = spots(here, self._before, after, self._threshold)
+                found, left = spots(here, self._before, after, self._threshold)
+                self.left += left
                 if found.any():
                     views.repaired[view] += found.sum()
                     fill(views.data[view], plan_fill(found))
@@ -109,40 +115,104 @@ class SpotFilter:
         return views[:n]
 
 
-def spots(view: Image, before: Image | None, after: Image | None, threshold: float) -> Mask:
-    """bool [row, col], pixels that a stray photon lit: brighter than the neighbouring views, and than what is around.
-
-    All images are √transmission, where photon noise is uniform. A spot is at most three pixels wide along its row and
-    its column: edges and gaps of a sample are longer, or are in a neighbouring view. A pixel brighter than all of the
-    view before is light of no sample: it may be part of a line, and the next view may have a spot there, too.
+def without_spots(frames: Iterable[NDArray[Any]], light: float) -> Iterator[tuple[NDArray[Any], int]]:
+    """Darks or flats [row, col] as they were taken, of each the number of pixels in spots: there it has the mean of the
+    frames beside it. A single frame stays as it is.
 
     Args:
-        before, after: the views beside it in angle; None: there is none.
+        light: counts of the open beam.
+    """
+    before: NDArray[Any] | None = None
+    left = iter(frames)
+    here = next(left, None)
+    while here is not None:
+        after = next(left, None)
+        roots = [None if each is None else _root_of(each, light) for each in (before, after)]
+        n, beside = 0, [each for each in (before, after) if each is not None]
+        if beside:
+            found, _ = spots(_root_of(here, light), *roots, _OF_REFERENCES, still=True)
+            if n := np.count_nonzero(found):
+                here = np.where(found, np.mean(beside, axis=0), here)
+        yield here, n
+        before, here = here, after
+
+
+def _root_of(counts: NDArray[Any], light: float) -> Image:
+    return np.sqrt(np.maximum(counts, 0) / max(light, 1e-30), dtype=np.float32)
+
+
+def spots(
+    view: Image, before: Image | None, after: Image | None, threshold: float, *, still: bool = False
+) -> tuple[Mask, int]:
+    """bool [row, col], pixels that a stray photon lit: brighter than the neighbouring views, and than what is around;
+    and how many belong to spots that are too large.
+
+    All images are √transmission, where photon noise is uniform. A spot is at most three pixels wide along its row and
+    its column, and the view before, which is free of spots, has none within a pixel: edges of a sample are longer, and
+    its gaps move on. A gap between opaque grains may open in a single view. So where a neighbouring view is opaque, a
+    spot is light of no sample: brighter than the open beam, and than all that both neighbours have. Such light may be
+    part of a line, and the next view may have a spot there, too.
+
+    Args:
+        before, after: the views beside it in angle; None: there is none. They are made as bright as the view where most
+            of it is brighter than both: its light has changed.
         threshold: standard deviations of the noise by which a spot is brighter. The noise is the largest of three: that
             between the pixels of this view, that between both neighbours around the pixel (the sample turns), and 1 %
             of the light. A normal variable exceeds 8 of them once in 10¹⁵ pixels.
+        still: there is no sample that moves, nor gaps in it.
     """
     found, beside = np.zeros(view.shape, np.bool_), [image for image in (before, after) if image is not None]
-    limit = threshold * max(deviation_between_neighbours(view[:: max(1, len(view) // _NOISE_ROWS)]), _LEAST)
     first, *others = beside or [np.zeros_like(view)] * 2
     second, against = others[0] if others else first, others[0] if others else view
-    brightest = float(first.max()) + limit if beside else np.inf
-    _mark(view, first, second, against, limit, brightest, threshold / _MEDIAN, found)
-    return found
+    noise, change = _noise_and_change(view, first, second)
+    limit = threshold * max(noise / _MEDIAN, _LEAST)
+    if change > 1 + _LEAST:
+        first, second = first * np.float32(change), second * np.float32(change)
+        against = second if others else view
+    beam = 1.0 if beside and not still else np.inf
+    return found, _mark(view, first, second, against, limit, beam, threshold / _MEDIAN, found)
+
+
+@njit(nogil=True, cache=True)
+def _noise_and_change(view, before, after):  # type: ignore[no-untyped-def]
+    """Medians over some lit pixels: of the difference to the next one, and of the light over that of the brighter
+    neighbour (0 where none is lit, or the sum is no larger)."""
+    rows, cols = view.shape
+    step = max(1, rows * cols // _SAMPLE)
+    differences, ratios = np.empty((2, rows * cols // step + 1), np.float32)
+    n = lit = 0
+    more = 0.0
+    for at in range(0, rows * cols, step):
+        r, c = at // cols, at % cols
+        if c + 1 < cols and view[r, c] > _OPAQUE:
+            differences[n] = abs(view[r, c + 1] - view[r, c])
+            n += 1
+        usual = max(before[r, c], after[r, c])
+        if usual > _OPAQUE:
+            ratios[lit] = view[r, c] / usual
+            more += view[r, c] - usual
+            lit += 1
+    noise = np.median(differences[:n]) if n > _FEWEST else 0.0
+    return noise, np.median(ratios[:lit]) if more > 0 else 0.0
 
 
 @njit(nogil=True, cache=True)
 def _mark(  # type: ignore[no-untyped-def]
-    view, before, after, against, limit, brightest, errors, found
+    view, before, after, against, limit, beam, errors, found
 ):
-    """Mark the spots of `spots`: `against` is compared with the view before around them; `brightest`: from there on
-    light is of no sample; `errors`: the threshold over the median difference of two normal variables."""
+    """Mark the spots of `spots`, and count the pixels of larger ones: `against` is compared with the view before around
+    them; `beam`: √light of the open beam, inf where no sample has gaps; `errors`: the threshold over the median
+    difference of two normal variables."""
     rows, cols = view.shape
     differences = np.empty((2 * _AROUND + 1) ** 2, np.float32)
+    left, brightest = 0, beam
+    for r in range(rows):
+        for c in range(cols):
+            brightest = max(brightest, min(before[r, c], after[r, c]))
     for r in range(rows):
         for c in range(cols):
             light = view[r, c]
-            stray = light > brightest
+            stray = light > brightest + limit
             if light <= before[r, c] + limit or (not stray and light <= after[r, c] + limit):
                 continue
             along, down = -np.inf, -np.inf  # the least light of the brightest piece of its line that is no spot
@@ -152,12 +222,18 @@ def _mark(  # type: ignore[no-untyped-def]
                 if r + first >= 0 and r + first + _WIDEST < rows:
                     down = max(down, view[r + first : r + first + _WIDEST + 1, c].min())
             around = min(along, down) if stray and down > -np.inf else max(along, down)
-            height = light - max(around, before[r, c] if stray else max(before[r, c], after[r, c]))
-            if height <= limit:
-                continue
-            n = 0
-            for i in range(max(0, r - _AROUND), min(rows, r + _AROUND + 1)):
-                for j in range(max(0, c - _AROUND), min(cols, c + _AROUND + 1)):
-                    differences[n] = abs(before[i, j] - against[i, j])
-                    n += 1
-            found[r, c] = height > errors * np.median(differences[:n])
+            if not stray:
+                if beam < np.inf and min(before[r, c], after[r, c]) < _OPAQUE:
+                    continue
+                near = before[max(0, r - 1) : r + 2, max(0, c - 1) : c + 2].max()
+                around = max(around, near, after[r, c])
+            height = light - max(around, before[r, c])
+            if height > limit:
+                n = 0
+                for i in range(max(0, r - _AROUND), min(rows, r + _AROUND + 1)):
+                    for j in range(max(0, c - _AROUND), min(cols, c + _AROUND + 1)):
+                        differences[n] = abs(before[i, j] - against[i, j])
+                        n += 1
+                found[r, c] = height > errors * np.median(differences[:n])
+            left += stray and not found[r, c]
+    return left

@@ -14,13 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from recon.base.arrays import F32, F64, I64, Mask
+from recon.base.arrays import F32, F64, I64, Mask, median_deviation
 from recon.base.masks import areas, fill, plan_fill
 
 NO_RUNS = np.zeros((0, 4), np.int64)
 NO_RUNS.flags.writeable = False
 DARK = 0.01  # transmission, below which a pixel has no light that counts
-_BLOCK, _RIM = np.ones((3, 3), np.bool_), np.ones((5, 5), np.bool_)  # two pixels: interpolation, blur of an edge
+_BLOCK = np.ones((3, 3), np.bool_)
+_RIM, _BEYOND = 4, 3  # pixels beside an area that interpolation or blur reach at most, and those that tell whether
+_ALTERED, _SURE = 0.02, 3.0  # of the light, and standard errors, by which a rim differs from what lies beyond it
 _FEWEST = 3  # dark pixels, at a border and in an area
 _ONE_VALUE = 0.9  # of the pixels of an area are dark, and have one value, where it is not noise
 _BELOW = 3.0  # standard deviations below the dark, as no camera reads
@@ -55,8 +57,43 @@ def unmeasured(values: NDArray[np.generic], light: F32, hidden: Mask, foreign: M
             nothing_seen |= labels == label
     if foreign is not None:
         nothing_seen |= (labels > 0) & foreign[:, None]
-    nothing_seen = (ndimage.binary_dilation(nothing_seen & ~hidden, _RIM) | areas(unknown)) & ~hidden
+    nothing_seen = with_rim(nothing_seen & ~hidden, np.where(hidden, np.float32(np.nan), light)) | areas(unknown)
+    nothing_seen &= ~hidden
     return nothing_seen if nothing_seen.any() and not (nothing_seen | hidden).all() else None
+
+
+def with_rim(dark: Mask, light: F32) -> Mask:
+    """Dark areas [row, col], and on each of their four sides the pixels beside them whose light is not their own.
+
+    Blur, or interpolation by a shift, mixes the light of an edge: the pixels next to it on this side differ, in the
+    median, from a straight line through the logarithms of the next three, and so on outwards. Rows that are not read,
+    or a shift by whole pixels, leave the next pixel as it was.
+
+    Args:
+        light: transmission [row, col]; NaN: unknown.
+    """
+    found, at = dark.copy(), np.arange(1, _RIM + _BEYOND + 1)
+    lines = np.pad(np.where(dark, np.nan, np.log(np.maximum(light, DARK))), at[-1], mode="edge")
+    for turn in range(4):
+        area, known = np.rot90(found, turn), np.rot90(lines, turn)
+        row, col = np.nonzero(area[:, :-1] & ~area[:, 1:])
+        beside, reach = known[at[-1] + row[:, None], at[-1] + col[:, None] + at], 0
+        while row.size and reach < _RIM and _mixed(beside[:, reach : reach + 1 + _BEYOND]):
+            reach += 1
+            area[row, np.minimum(col + reach, area.shape[1] - 1)] = True
+    return found
+
+
+def _mixed(lines: F64) -> bool:
+    """Whether the first of pixels side by side [edge, pixel] has not the light that the others lead to; logarithms."""
+    lines = lines[np.isfinite(lines).all(axis=1)]
+    if not len(lines):
+        return True
+    others = lines[:, 1:]
+    steps = (others[:, -1] - others[:, 0]) / (_BEYOND - 1)
+    away = lines[:, 0] - others.mean(axis=1) + steps * (_BEYOND + 1) / 2
+    middle = np.median(away)
+    return bool(abs(middle) > max(_ALTERED, _SURE * median_deviation(away - middle) / np.sqrt(len(away))))
 
 
 def foreign_rows(light: F32, angles: F64) -> Mask:
@@ -79,7 +116,7 @@ def foreign_rows(light: F32, angles: F64) -> Mask:
     lines = -np.log(np.maximum(light[:, rows], np.float32(DARK)))
     mass = lines.sum(axis=(1, 2), dtype=np.float64)
     for view in np.flatnonzero(with_dark):
-        hidden = ndimage.binary_dilation(dark[view], _RIM)[rows]
+        hidden = with_rim(dark[view], light[view])[rows]
         if hidden.all():
             lines[view] = 0
         else:
@@ -95,7 +132,7 @@ def with_borders_filled(image: NDArray[Any]) -> NDArray[Any]:
     if (_corners(image) != 0).all():
         return image
     labels = _at_borders(image == 0, np.zeros(image.shape, np.bool_))
-    blank = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _RIM)
+    blank = ndimage.binary_dilation(np.isin(labels, _corners(labels)) & (labels > 0), _BLOCK, 2)
     nearest = ndimage.distance_transform_edt(blank, return_distances=False, return_indices=True)
     return image if blank.all() else image[tuple(nearest)]
 
@@ -112,7 +149,8 @@ def _at_borders(low: Mask, hidden: Mask) -> NDArray[np.int32]:
     if sum(np.count_nonzero(side) for side in (low[0], low[-1], low[:, 0], low[:, -1])) < _FEWEST:
         return np.zeros(low.shape, np.int32)
     dark = np.pad(low | hidden, 3, mode="edge")  # the outer layer goes in closing
-    labels, n = ndimage.label(ndimage.binary_opening(ndimage.binary_closing(dark, _BLOCK), _BLOCK)[3:-3, 3:-3], _BLOCK)
+    solid = ndimage.binary_opening(ndimage.binary_closing(dark, _BLOCK), _BLOCK)[3:-3, 3:-3]
+    labels, n = ndimage.label(solid | (low & (low.mean(axis=1) > _ONE_VALUE)[:, None]), _BLOCK)  # also single rows
     at_border = np.unique(np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1])))
     large = np.bincount(labels[low & ~hidden], minlength=n + 1) >= _FEWEST
     return np.where(np.isin(labels, at_border[at_border > 0]) & large[labels], labels, 0)

@@ -82,7 +82,7 @@ class FieldEdges:
     continued: bool = False
 
     @classmethod
-    def of(cls, data: F32, geometry: Geometry) -> FieldEdges:
+    def of(cls, data: F32, geometry: Geometry, weights: F32 | None = None) -> FieldEdges:
         """Edge levels of up to 32 views, in the rows that show matter.
 
         Medians over views and rows: corners at some angles do not count. The least of the quarters: a beam drifts away
@@ -91,14 +91,15 @@ class FieldEdges:
 
         Args:
             data: line integrals [view, row, col]; values that are not finite do not count.
+            weights: of these; those of weight 0 do not count, either. None: all count.
         """
         n, cols = len(data), data.shape[2]
         width = max(2, cols // 50)
         if n == 0 or cols < 2 * width:
             return cls({}, 0.0)
         views = spread(np.arange(n), _VIEWS)
-        some = data[np.ix_(views, np.arange(0, data.shape[1], max(1, data.shape[1] // _ROWS)))]
-        some = np.where(np.isfinite(some), some, np.nan)
+        part = np.ix_(views, np.arange(0, data.shape[1], max(1, data.shape[1] // _ROWS)))
+        some = np.where(np.isfinite(data[part]) & (weights is None or weights[part] > 0), data[part], np.nan)
         mass = np.maximum(np.nan_to_num(some).mean(axis=(0, 2)), 0)
         some = some[:, mass >= _FULL * mass.max()]
         edges = {"left": some[..., :width], "right": some[..., -width:]}

@@ -100,12 +100,12 @@ def predicted_views(
     Args:
         method: that makes the volume.
         data: line integrals [view, row, col].
-        known: [row, col] weights of pixels; None: one for all.
+        known: [row, col] or [view, row, col] weights of pixels; None: one for all.
     """
     order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind="stable")
     unseen = order[1::one_in]
     seen = np.setdiff1d(order, unseen)
-    weights = None if known is None else np.broadcast_to(known, data[seen].shape).astype(np.float32)
+    weights = None if known is None else np.broadcast_to(known, data.shape)[seen].astype(np.float32)
     part = ReconProblem(data[seen], geometry.select(seen), grid, DataUse(weights), 0, "cpu")
     volume = method.run(part, RunControl()).volume
     return unseen, Projector(geometry.select(unseen), grid).forward(volume.data)

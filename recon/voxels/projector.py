@@ -21,7 +21,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, Mask
 from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
 from recon.base.slabs import bands_of
@@ -39,6 +39,7 @@ _TALL = 0.25  # of the box's height: views that climb by more within the field k
 _EDGE_ROWS = 0.01  # slices beyond the outer ones that still count as seen
 _LOOK = 1.0  # px at the edge of the field from one angle within an exposure to the next
 _MOST_LOOKS = 16
+_LOOKED_AT = 32  # views, about, that tell which rows see a voxel
 _STEEP = 1e-8  # of a squared cosine: columns along the rotation axis
 
 
@@ -240,6 +241,14 @@ def volume_lines(volume: F32) -> F32:
     """[z, y, x] to a new [y, x, z]."""
     nz, ny, nx = volume.shape
     return projection_lines(_plain(volume).reshape(1, nz, ny * nx)).reshape(ny, nx, nz)
+
+
+def measured_share(known: Mask, geometry: Geometry, grid: Grid) -> F32:
+    """Share [z, y, x] of the rays through each voxel that are of known rows [row] of the detector; 0 where none are."""
+    some = geometry.select(np.arange(0, geometry.n_views, max(1, geometry.n_views // _LOOKED_AT)))
+    projector, rays = Projector(some, grid, matched=False), np.ones((some.n_views, *some.detector_shape), np.float32)
+    every = projector.adjoint(rays)
+    return np.asarray(projector.adjoint(rays * known[:, None]) / np.maximum(every, np.float32(1e-30)), np.float32)
 
 
 def volume_slices(lines: F32) -> F32:

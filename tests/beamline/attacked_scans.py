@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.storage.readers.base import Quantity
 from tests.beamline.array_source import ArraySource
 from tests.bench.clean_scans import lines_of
 
@@ -37,7 +38,7 @@ class Parts:
     last_flats: F64 = field(default_factory=lambda: np.zeros((0, *SHAPE)))
     exposures: F64 | None = None
     dtype: type = np.uint16
-    quantity: str = "counts"
+    quantity: Quantity = "counts"
     stated: dict[str, Any] = field(default_factory=dict)
 
     def source(self) -> ArraySource:

@@ -90,7 +90,7 @@ class Ran:
         with open_scan(self.folder / "scan.h5") as source:
             assert source.finished
             frames = list(source.frames())
-            assert len(frames) == len(source.image_key) == n
+            assert len(frames) == len(source.table.kinds) == n
             assert_true(frames)
         with h5py.File(self.folder / "scan.h5") as file:
             progress = file["entry/progress"]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
+from beamline.storage.recorded_frames import record_checksums
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.writers.rows import record_checksums
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
 from recon.base.volume import Grid

@@ -122,7 +122,7 @@ def scanned(config: Config, folder: Path) -> Scanned:
     with patch.object(Decider, "__call__", timed), suppress(ScanStopped):
         run_scan(config, folder, [note], stop, live=how.live, afterwards=how.afterwards)
     with open_scan(path) as source:
-        return Scanned(source.decisions, source.image_key.size, tuple(waits), time.monotonic() - begin)
+        return Scanned(source.decisions, len(source.table), tuple(waits), time.monotonic() - begin)
 
 
 def lines_of(scan: Scanned) -> list[str]:

@@ -69,6 +69,22 @@ def test_the_axis_where_part_of_the_detector_has_no_beam(dark: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("sides", [1, 2])
+def test_the_axis_where_posts_pass_in_front_of_the_sample(sides: int) -> None:
+    """Their pixels are filled with what draws the axis away; they count as not measured."""
+    n, angles = 96, np.pi * np.arange(90) / 90
+    balls = Bodies(1.5 * BALLS[:, :3], np.eye(3) / (1.5 * BALLS[:, 3, None, None]), np.ones(3))
+    views = balls.views(geometry := Geometry.parallel(angles, (6, n), axis_col=46.2))
+    lit = np.ones(views.shape, np.bool_)
+    for side in range(sides):
+        middle = 46.2 + 50 * np.cos(angles + 0.3 + np.pi * side)
+        lit &= (np.abs(np.arange(n) - middle[:, None]) > 9)[:, None]
+    views[~lit] = 2.0
+    found = axis_by_views(views, replace(geometry, axis_col=47.5), lit=lit)
+    assert found.value == pytest.approx(46.2, abs=0.15) and found.confident
+
+
+@pytest.mark.slow
 def test_an_axis_beyond_the_search_is_an_error_and_noise_shows_none() -> None:
     with pytest.raises(AxisError, match=r"12 columns.*best with column"):
         axis_by_views(_views(29.2, SOD, SDD), Geometry.cone(ANGLES, (ROWS, COLS), 1.0, SOD, SDD, axis_col=50.0))

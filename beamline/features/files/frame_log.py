@@ -13,8 +13,8 @@ from recon.base.arrays import I64
 
 def time_order(source: ScanSource) -> Iterator[Finding]:
     """Frames are in the order of their times."""
-    if source.times is not None and (back := np.flatnonzero(np.diff(source.times) < 0)).size:
-        step = np.diff(source.times)[back[0]]
+    if source.table.times is not None and (back := np.flatnonzero(np.diff(source.table.times) < 0)).size:
+        step = np.diff(source.table.times)[back[0]]
         yield Finding(
             "error", "time-order", f"Time goes back {back.size} times (first: frame {back[0] + 1}, by {-step:.6g} s)."
         )
@@ -26,15 +26,17 @@ def framestamp_order(source: ScanSource) -> Iterator[Finding]:
     It starts again where the camera was armed anew: with other frames, or for other triggers of the same ones, or with
     another part of a joined file. Not always at 0, for the first frame may be lost.
     """
-    stamps, triggers, key = source.framestamps, source.triggers, source.image_key
+    stamps, triggers, key = source.table.framestamps, source.table.triggers, source.table.kinds
     if stamps.size < 2 or (stamps < 0).any():
         return
     steps, rows = np.diff(stamps), np.arange(key.size)
-    passes = np.searchsorted(source.pass_ends, rows, "right")  # one may be repeated
-    aside = np.zeros(key.size) if source.aside_mm is None else source.aside_mm  # wide views count on, as retakes do
+    passes = np.searchsorted(source.table.pass_ends, rows, "right")  # one may be repeated
+    aside = (
+        np.zeros(key.size) if source.table.aside is None else source.table.aside
+    )  # wide views count on, as retakes do
     new = np.zeros(key.size, np.bool_)
     new[np.unique(np.stack([key, triggers, passes, aside]), axis=1, return_index=True)[1]] = True
-    new[source.part_starts] = True
+    new[source.table.part_starts] = True
     armed = (np.diff(passes) > 0) | (new[1:] & ((steps < 0) | (stamps[1:] == 0)))
     same_block = (np.diff(key) == 0) & ~armed
     repeated = np.flatnonzero(same_block & (steps <= 0))
@@ -58,6 +60,6 @@ def framestamp_order(source: ScanSource) -> Iterator[Finding]:
 
 def _taken_again(source: ScanSource, at: int, step: I64) -> bool:
     """Whether each trigger between a frame and the next has its frame elsewhere in the file."""
-    triggers, key = source.triggers, source.image_key
+    triggers, key = source.table.triggers, source.table.kinds
     between = np.arange(triggers[at] + 1, triggers[at + 1])
     return between.size == step - 1 and bool(np.isin(between, triggers[key == key[at]]).all())

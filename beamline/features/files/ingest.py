@@ -8,13 +8,11 @@ rounding would lose what was measured. They keep their type, at the same paths, 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import json_of
@@ -27,8 +25,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.scan import altered_sentence, parts_joined, stated_used
 from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
-from beamline.storage.writers.rows import DIED, PER_FLUSH, RUNNING, Record, Rows, ScanEnding, complete
-from drivers.base.frame import FrameKind
+from beamline.storage.writers.rows import DIED, PER_FLUSH, RUNNING, Rows, ScanEnding, complete
 
 
 @dataclass(frozen=True)
@@ -83,14 +80,14 @@ def ingest(
             distance_mm=distance if isinstance(distance, int | float) else None,
             source_distance_mm=None if source.cone is None else source.cone[0],
             plan=json_of({} if other_angles else dict(source.plan)),
-            wide_views=source.aside_mm is not None,
-            decides=source.pass_ends.size > 0,
+            wide_views=source.table.aside is not None,
+            decides=source.table.pass_ends.size > 0,
         )
         with hdf5.created(partial, layout.LIBVER) as file:
             invalid = _copy(source, file, out, info, no_data, progress)
             complete(file, ending)
         definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
-        frames = int(source.image_key.size)
+        frames = len(source.table)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
         findings = (*parts_joined(source), *(each for each in stated_used(source) if each.severity != "info"))
         return Ingested(out, definition, frames, size, invalid, tuple(finding.message for finding in findings))
@@ -98,18 +95,18 @@ def ingest(
 
 def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:
     """Raise DataError for unknown angles, displaced views, altered rows and oblong pixels."""
-    views = source.image_key == FrameKind.PROJECTION
-    if unknown := np.count_nonzero(~np.isfinite(source.angles[views])):
+    n = source.table.views.size
+    if unknown := n - source.table.placed_views.size:
         raise DataError(
-            f"{source.path} does not say the angles of {unknown} of its {views.sum()} projections: give "
+            f"{source.path} does not say the angles of {unknown} of its {n} projections: give "
             "--angles FILE (degrees, one a line). Nothing was written."
         )
-    if source.shifts is not None:
+    if source.table.shifts is not None:
         raise DataError(
             f"{source.path} states by how much its views are displaced, which the copy would not. Reconstruct it "
             "as it is. Nothing was written."
         )
-    if source.altered:
+    if source.table.altered.any():
         raise DataError(f"{altered_sentence(source)} Nothing was written.")
     if source.row_pitch_mm is not None:
         raise DataError(
@@ -130,20 +127,21 @@ def _copy(
     layout.create(file, info, source.shape, dtype, quantity=source.quantity, preview_bin=4, start=None)
     if no_data is not None:
         file["/entry/record/no_data"] = float(no_data)
-    if source.part_starts.size > 1:
-        file[layout.PART_STARTS] = source.part_starts
+    if source.table.part_starts.size > 1:
+        file[layout.PART_STARTS] = source.table.part_starts
     if info.decides:
         lines = [json_of(values).encode() for values in source.decisions]
-        for path, column in ((layout.PASS_ENDS, source.pass_ends), (layout.DECISIONS, lines)):
+        for path, column in ((layout.PASS_ENDS, source.table.pass_ends), (layout.DECISIONS, lines)):
             file[path].resize(len(column), 0)
             file[path][...] = np.array(column, file[path].dtype)
     rows = Rows(file)
     saturation = np.iinfo(dtype).max if dtype.kind in "iu" else None
-    n, invalid = int(source.image_key.size), 0
-    for i, (given, record) in enumerate(_frames(source)):
-        image = given.astype(dtype, copy=False)
-        if i in source.unreadable:
-            raise DataError(f"{source.unreadable[i]} Nothing is left of {out}.")
+    table, invalid = source.table, 0
+    for i in range(len(table)):
+        try:
+            image = source.read([i])[0].astype(dtype, copy=False)
+        except hdf5.UnreadableError as error:
+            raise DataError(f"{error} Nothing is left of {out}.") from error
         if i in source.damaged:
             raise DataError(
                 f"Frame {i} of {source.path} does not have the pixels that were written: its checksum differs. Use a "
@@ -151,10 +149,11 @@ def _copy(
             )
         statistics = digest(image, saturation=saturation, no_data=no_data)
         invalid += statistics.invalid_fraction == 1.0
-        rows.write(i, image, statistics, record)
+        frame = replace(table.frame(i, image), replaces=-1)
+        rows.write(frame, statistics, UNMARKED if table.flags is None else table.flags.mark(i))
         file.require_taken()
         if progress is not None:
-            progress(i + 1, n)
+            progress(i + 1, len(table))
         if (i + 1) % PER_FLUSH == 0:
             rows.flush()
     rows.flush()
@@ -171,16 +170,3 @@ def _ending_of(source: ScanSource) -> ScanEnding:
             "Nothing was written."
         )
     return replace(source.ending, status="failed", reason=DIED)
-
-
-def _frames(source: ScanSource) -> Iterator[tuple[NDArray[Any], Record]]:
-    """Pixels and metadata of each frame; a scan of ours (even if its writer died) keeps its log."""
-    flags = source.flags
-    if source.dtype == np.uint16:
-        for i, frame in enumerate(source.frames()):
-            known = (frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time)
-            yield frame.counts, Record(*known, UNMARKED if flags is None else flags.mark(i), aside=frame.aside)
-    else:
-        keys, angles, exposures = source.image_key, source.angles, source.exposures
-        for i in range(keys.size):
-            yield source.read([i])[0], Record(FrameKind(int(keys[i])), float(angles[i]), float(exposures[i]))

@@ -18,15 +18,16 @@ from beamline.core.errors import DataError, damaged, user_message
 from beamline.core.text import count, spans
 from beamline.features.files.frame_log import framestamp_order, time_order
 from beamline.storage import hdf5
-from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known, rows_replaced
+from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.transforms import brief_source
+from beamline.storage.readers.transforms import WRAPPED, brief_source
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.pixels import CONSTANT_DARKS
 from beamline.storage.rules.references import VIEWS, ViewLight, reference_groups, references_usable
 from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, central_ray_taken, scan_ended
+from beamline.storage.rules.stored_order import SINOGRAM
 from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writer_lock import abandoned, held
@@ -100,22 +101,25 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
 
 
 def source_findings(source: ScanSource) -> list[Finding]:
-    """Findings in an open scan: its content, its references, and its flagged frames."""
+    """Findings in an open scan: its content, its references, and its flagged frames. Numbers that wrapped explain all
+    that light and references show."""
     findings = list[Finding]()
     for rule in (*SOURCE_RULES, central_ray_taken, scan_ended, references_usable, darks_beside_views, frames_flagged):
         try:
             findings += rule(source)
         except TakesTooLongError as error:
             findings.append(Finding("warning", "brief", str(error)))
+    if any(finding.rule == WRAPPED and finding.severity == "error" for finding in findings):
+        findings = [finding for finding in findings if finding.rule not in ("light", "bad-references")]
     return [*dict.fromkeys(findings)]
 
 
 def views_lit(source: ScanSource, every: bool) -> Iterator[Finding]:
     """Views have light throughout the scan. `beamline recon` names and leaves out dark views."""
     counted = source.quantity == "counts"
-    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    views = source.table.views
     kinds = {FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION}
-    if not counted or not kinds <= {*source.image_key.tolist()}:
+    if not counted or not source.table.has(*kinds):
         return
     looked_at = views if every else spread(views, VIEWS)
     light = ViewLight.of(source, reference_groups(source))
@@ -137,8 +141,8 @@ def frames_as_written(source: ScanSource, progress: Progress | None) -> Iterator
     Args:
         progress: how many of how many frames were read; None: only those that other rules have read are judged.
     """
-    n, unreadable, why = int(source.image_key.size), list[int](), ""
-    if source.altered:
+    n, unreadable, why = len(source.table), list[int](), ""
+    if source.table.altered.any():
         yield Finding("error", "records", altered_sentence(source))
     for row in range(n) if progress is not None else ():
         try:
@@ -211,7 +215,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     are the numbers that the file states and nobody uses, by path. `findings` are the
     messages of errors and warnings, `reconstructable` whether no error stands against a reconstruction.
     """
-    kinds = {kind.name.lower(): int((source.image_key == kind).sum()) for kind in FrameKind}
+    kinds = {kind.name.lower(): source.table.of_kind(kind).size for kind in FrameKind}
     until = clock() + LOOK
     brief = brief_source(source, lambda: clock() > until)
     findings = source_findings(brief)
@@ -223,7 +227,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     facts = {
         "path": str(source.path),
         "format": source.format,
-        "frames": int(source.image_key.size),
+        "frames": len(source.table),
         "shape": tuple(source.shape),
         "dtype": str(source.dtype),
         "bytes": _size(source.path),
@@ -245,8 +249,8 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
         "attributes": {f"{name} (of the file)" if name in facts else name: v for name, v in attributes.items()},
         "not_used": {field.where: f"{field.value} (not used: {field.why})" for field in source.not_used},
         "findings": [
-            *(each.message for each in findings if each.severity != "info" or each.rule == CONSTANT_DARKS),
-            *([altered_sentence(source)] if source.altered else []),
+            *(each.message for each in findings if each.severity != "info" or each.rule in (CONSTANT_DARKS, SINOGRAM)),
+            *([altered_sentence(source)] if source.table.altered.any() else []),
             *(_fringes(brief) if facts["reconstructable"] else []),
         ],
     }
@@ -257,7 +261,7 @@ def _fringes(source: ScanSource) -> list[str]:
     rows = slice(*np.clip(source.shape[0] // 2 + np.array([-16, 16]), 0, source.shape[0]).tolist())
 
     def read(kind: FrameKind) -> F32:
-        return read_known(source, spread(np.flatnonzero(source.image_key == kind), MOST_VIEWS), rows).astype(np.float32)
+        return read_known(source, spread(source.table.of_kind(kind), MOST_VIEWS), rows).astype(np.float32)
 
     with suppress(DataError, TakesTooLongError):
         views = read(FrameKind.PROJECTION)
@@ -274,10 +278,10 @@ def _fringes(source: ScanSource) -> list[str]:
 
 
 def _angles(source: ScanSource) -> dict[str, float | None]:
-    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
-    if (replaces := source.replaces) is not None:  # in the order in which they were planned
+    views = source.table.views
+    if (replaces := source.table.replaces) is not None:  # in the order in which they were planned
         views = views[np.argsort(np.where(replaces[views] >= 0, replaces[views], views))]
-    angles = np.degrees(source.angles[views])
+    angles = np.degrees(source.table.angles[views])
     if angles.size == 0 or not np.isfinite(angles).all():
         return {"first_angle_deg": None, "last_angle_deg": None, "step_deg": None}
     step = float(np.median(np.diff(np.unique(angles)))) if np.unique(angles).size > 1 else None
@@ -285,14 +289,14 @@ def _angles(source: ScanSource) -> dict[str, float | None]:
 
 
 def _flags(source: ScanSource) -> dict[str, Any]:
-    flags = source.flags
+    flags = source.table.flags
     if flags is None:
         return {"flagged_frames": None, "alarmed_frames": None, "flags": None, "retaken_views": None}
     return {
         "flagged_frames": int(flags.flagged.sum()),
         "alarmed_frames": int(flags.alarmed.sum()),
         "flags": flags.counts(),
-        "retaken_views": rows_replaced(source).size,
+        "retaken_views": source.table.replaced.size,
     }
 
 

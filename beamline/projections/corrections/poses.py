@@ -15,7 +15,6 @@ from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
 from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import Selection, cone_of, pivot_of, pixel_size, rows_of, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
-from drivers.base.frame import FrameKind
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,7 +79,7 @@ def stated_poses(source: ScanSource, selection: Selection) -> PoseTable | None:
     """The poses in the option's file, or else the shifts stated by the scan file."""
     from beamline.storage.pose_table import PoseTable
 
-    table, shifts = selection.step(PosesOfFile).table, source.shifts
+    table, shifts = selection.step(PosesOfFile).table, source.table.shifts
     if table is not None:
         return table if table.keys.size else None
     if shifts is None:
@@ -171,7 +170,7 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
             f"{table.path}: {table.by} {table.keys[row]:g} is displaced by {shifts[row, 0]:g} columns and "
             f"{shifts[row, 1]:g} rows on a detector of {width} x {height}; expected pixels of the unbinned detector."
         )
-    n = source.image_key.size
+    n = len(source.table)
     every = np.full((n, 4), np.nan)
     every[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
     pivot, sentence = pivot_of(source, selection), _sentence(table, shifts)
@@ -224,10 +223,10 @@ def _pixels(table: PoseTable, source: ScanSource, selection: Selection) -> float
 
 def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
     """[frame of the scan] its row in the table; -1: none. Angles that both state must agree."""
-    n, views = source.image_key.size, np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    n, views = len(source.table), source.table.views
     if table.frames is not None and table.frames != n:
         raise DataError(f"{table.path} has {table.frames} frames, {source.path} has {n}; expected the same scan.")
-    row_of_frame, degrees = np.full(n, -1, np.int64), np.degrees(source.angles)
+    row_of_frame, degrees = np.full(n, -1, np.int64), np.degrees(source.table.angles)
     distances = np.diff(np.unique(np.round(degrees[frames], 9)))
     tolerance = _OFF * (float(np.median(distances)) if distances.size else 1.0)
     if table.by == "angle_deg":
@@ -264,7 +263,7 @@ def require_stated(poses: ScanPoses, source: ScanSource, selection: Selection, v
     """Raise DataError if views lack a pose."""
     unknown, table = view_ids[~poses.stated(view_ids)], stated_poses(source, selection)
     if unknown.size and table is not None:
-        degrees = np.degrees(source.angles[unknown[0]])
+        degrees = np.degrees(source.table.angles[unknown[0]])
         raise DataError(
             f"{table.path} states no pose of {unknown.size} of the {view_ids.size} views chosen of {source.path} "
             f"(the first: frame {unknown[0]}, at {degrees:.6g} degrees). Add them, or choose the others with --views."

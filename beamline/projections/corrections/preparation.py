@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, get_args
 
 from beamline.projections.step import StepDone, StepMemory, option, positive
-from drivers.base.frame import FrameKind
 from recon.base.choices import FEW_PHOTONS, FlatFields, Noise
 
 if TYPE_CHECKING:
@@ -119,5 +118,5 @@ class Preparation:
             return StepMemory()
         from recon.prep.dynamic_flats import search_memory, view_memory
 
-        pixels, flats = part.view_bytes() // 4, int((part.source.image_key == FrameKind.FLAT).sum())
+        pixels, flats = part.view_bytes() // 4, part.source.table.flats.size
         return StepMemory(view_memory(flats, pixels), search_memory(flats, pixels))

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.sinks import Warn
-from beamline.core.text import count
+from beamline.core.sinks import Note, Warn
+from beamline.core.text import count, spans
+from beamline.monitor.evidence import BRIGHT
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.read import read_binned, spoilt_frames
 from beamline.projections.selection import Selection
@@ -26,31 +28,90 @@ from drivers.base.frame import FrameKind
 from recon.prep.correct import References
 from recon.prep.dynamic_flats import find_dynamic_flats
 from recon.prep.references import dark_at, dead_pixels
+from recon.prep.spots import without_spots
 
 _STEADY = 0.01  # of the ring current: top-up keeps it so
 
 
-def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, selection: Selection) -> References:
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """Which pixels of darks and flats are read, binned, and the spots found in them.
+
+    Attributes:
+        light: counts of the open beam.
+        spots: pixels of bright spots, by frame.
+    """
+
+    source: ScanSource
+    rows: slice
+    binning: int
+    use_damaged: bool
+    light: float
+    spots: dict[int, int] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, source: ScanSource, groups: ReferenceGroups, rows: slice, selection: Selection) -> _Reading:
+        binning, flat = selection.binning, read_binned(source, groups.flats[0][:1], rows, selection.binning)
+        light = float(np.percentile(np.nan_to_num(flat), BRIGHT))
+        return cls(source, rows, binning, not selection.step(Preparation).uses_flags, light)
+
+    def images(self, frames: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[Any]]]:
+        """The frames [row, col] that may be used, one by one, without bright spots."""
+        used = list[int]()
+
+        def good() -> Iterator[NDArray[Any]]:
+            for frame in frames.tolist():
+                image = read_binned(self.source, np.array([frame]), self.rows, self.binning)[0]
+                if frame not in spoilt_frames(self.source, self.use_damaged):
+                    used.append(frame)
+                    yield image
+
+        for at, (image, n) in enumerate(without_spots(good(), self.light)):
+            if n:
+                self.spots[used[at]] = n
+            yield used[at], image
+
+    def mean(self, frames: NDArray[np.int64], weights: NDArray[np.float64] | None = None) -> NDArray[np.float64] | None:
+        """Mean of the frames that may be used, each times its weight [frame of the scan]; None where none may."""
+        total, n = 0.0, 0
+        for frame, image in self.images(frames):
+            total = total + (image if weights is None else weights[frame] * image).astype(np.float64)
+            n += 1
+        return np.asarray(total / n) if n else None
+
+    def darks(self, frames: NDArray[np.int64]) -> list[tuple[float, NDArray[np.float64]]]:
+        """The mean dark of each exposure; of all, with NaN for their exposure, where they have one or it is unknown."""
+        means = [(seconds, self.mean(some)) for seconds, some in by_exposure(self.source, frames)]
+        return [(seconds, mean) for seconds, mean in means if mean is not None]
+
+
+def read_references(
+    source: ScanSource,
+    groups: ReferenceGroups,
+    rows: slice,
+    selection: Selection,
+    warn: Warn = lambda sentence: None,
+) -> References:
     """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are required.
 
-    Frames that are damaged (see ScanSource) are left out, unless the selection uses all. The light of flats with an
-    exposure of their own is scaled to the projections': dark + (flat - its dark) * t / t_flat, where both are known.
-    Of darks of several exposures each kind of frame has its own, see `recon.prep.references.dark_at`.
+    Frames that are damaged (see ScanSource) are left out, unless the selection uses all, and bright spots of single
+    frames, which are told. The light of flats with an exposure of their own is scaled to the projections': dark +
+    (flat - its dark) * t / t_flat, where both are known. Of darks of several exposures each kind of frame has its own,
+    see `recon.prep.references.dark_at`.
 
     Raises:
         DataError: all frames of a kind are damaged.
     """
-
-    binning, use_damaged = selection.binning, not selection.step(Preparation).uses_flags
-    darks = _darks(source, np.concatenate(groups.darks), rows, binning, use_damaged)
+    reading = _Reading.of(source, groups, rows, selection)
+    darks = reading.darks(np.concatenate(groups.darks))
     dark = _dark_of(usual_exposure(source), darks)
     scale = light_scale(source, selection.step(Preparation).by_current)
     flats = []
     for group in groups.flats:
-        mean = _mean(source, group, rows, binning, scale[group], use_damaged)
+        mean = reading.mean(group, scale)
         if dark is not None and mean is not None:
-            used = np.setdiff1d(group, spoilt_frames(source, use_damaged))
-            own, light = _dark_of(float(np.median(source.exposures[used])), darks), scale[used].mean()
+            used = np.setdiff1d(group, spoilt_frames(source, reading.use_damaged))
+            own, light = _dark_of(float(np.median(source.table.exposures[used])), darks), scale[used].mean()
             net = (1 - light) * dark if own is dark or own is None else dark - light * own
             flats.append((float(used.mean()), (mean + net).astype(np.float32)))
     if dark is None or not flats:
@@ -58,19 +119,11 @@ def read_references(source: ScanSource, groups: ReferenceGroups, rows: slice, se
             f"{source.path}: all {'darks' if dark is None else 'flats'} are damaged: they cannot be read, or are not "
             "what was written, by their checksums. Use a good copy, or --flags ignore, which takes the latter."
         )
-    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.part_starts.tolist()))
-
-
-def _darks(
-    source: ScanSource, frames: NDArray[np.int64], rows: slice, binning: int, use_damaged: bool
-) -> list[tuple[float, NDArray[np.float64]]]:
-    """The mean dark of each exposure; of all, with NaN for their exposure, where they have one or it is unknown."""
-
-    means = [
-        (seconds, _mean(source, some, rows, binning, None, use_damaged))
-        for seconds, some in by_exposure(source, frames)
-    ]
-    return [(seconds, mean) for seconds, mean in means if mean is not None]
+    if reading.spots:
+        n, frames = sum(reading.spots.values()), spans(sorted(reading.spots))
+        told = f"{count(n, 'pixel')} of darks and flats (frames {frames}) were bright spots of single frames (zingers)"
+        warn(Note(f"{told}: filled from the frames beside them."))
+    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.table.part_starts.tolist()))
 
 
 def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) -> NDArray[np.float64] | None:
@@ -93,12 +146,12 @@ def with_dynamic_flats(
     asked = selection.step(Preparation)
     frames = np.setdiff1d(np.concatenate(groups.flats), spoilt_frames(source, not asked.uses_flags))
     scale = light_scale(source, asked.by_current)
-    darks = _darks(source, np.concatenate(groups.darks), rows, selection.binning, not asked.uses_flags)
+    reading = _Reading.of(source, groups, rows, selection)
+    darks = reading.darks(np.concatenate(groups.darks))
 
     def flats() -> Iterator[NDArray[np.float32]]:
-        for frame in frames:
-            image = read_binned(source, np.array([frame]), rows, selection.binning)[0]
-            dark = references.dark if len(darks) < 2 else _dark_of(float(source.exposures[frame]), darks)
+        for frame, image in reading.images(frames):
+            dark = references.dark if len(darks) < 2 else _dark_of(float(source.table.exposures[frame]), darks)
             yield ((image - dark) * np.float32(scale[frame])).astype(np.float32)
 
     masked = dead_pixels(references.dark, [flat for _, flat in references.flats], asked.hot_threshold)
@@ -114,17 +167,14 @@ def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.floa
     `by_current` also from its own ring current.
     """
 
-    scale = _to_median(exposures_of(source), source.image_key)
+    scale = _to_median(exposures_of(source), source.table.views)
     return scale * current_scale(source) if by_current else scale
 
 
-def _to_median(values: NDArray[np.float64], image_key: NDArray[np.int32]) -> NDArray[np.float64]:
+def _to_median(values: NDArray[np.float64], views: NDArray[np.int64]) -> NDArray[np.float64]:
     """The median of the projections over each frame's own; 1 where one is unknown."""
-    views = values[image_key == FrameKind.PROJECTION]
-    views = views[np.isfinite(views)]
-    if views.size == 0:
-        return np.ones(values.size)
-    return np.where(np.isfinite(values), np.median(views) / values, 1.0)
+    known = values[views][np.isfinite(values[views])]
+    return np.where(np.isfinite(values), np.median(known) / values, 1.0) if known.size else np.ones(values.size)
 
 
 def current_scale(source: ScanSource) -> NDArray[np.float64]:
@@ -133,19 +183,23 @@ def current_scale(source: ScanSource) -> NDArray[np.float64]:
     Raises:
         ConfigError: the file has none for some view or flat.
     """
-    used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
-    currents = source.currents
+    used = source.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
+    currents = source.table.currents
     if currents is None or not np.isfinite(currents[used]).all():
         lacking = "no ring current" if currents is None else "no ring current for some views or flats"
         raise ConfigError(f"--ring-current use: {source.path} has {lacking} (control/data of NXtomo). Leave it out.")
-    return _to_median(currents, source.image_key)
+    return _to_median(currents, source.table.views)
 
 
 def uncorrected_current(source: ScanSource, selection: Selection) -> str:
     """The warning that the ring current changed between flats and views and is not corrected; "" if it did not
     change."""
-    used = np.isin(source.image_key, (FrameKind.PROJECTION, FrameKind.FLAT))
-    if source.quantity != "counts" or selection.step(Preparation).by_current or (known := source.currents) is None:
+    used = source.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
+    if (
+        source.quantity != "counts"
+        or selection.step(Preparation).by_current
+        or (known := source.table.currents) is None
+    ):
         return ""
     currents = known[used]
     if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():
@@ -156,34 +210,15 @@ def uncorrected_current(source: ScanSource, selection: Selection) -> str:
     )
 
 
-def _mean(
-    source: ScanSource,
-    frames: NDArray[np.int64],
-    rows: slice,
-    binning: int,
-    weights: NDArray[np.float64] | None,
-    use_damaged: bool,
-) -> NDArray[np.float64] | None:
-    """Mean of the frames that may be used, each times its weight; float64 [row, col], binned; None where none may."""
-
-    total, n = np.zeros(((rows.stop - rows.start) // binning, source.shape[1] // binning), np.float64), 0
-    for i, frame in enumerate(frames):
-        image = read_binned(source, np.array([frame]), rows, binning)[0]
-        if int(frame) not in spoilt_frames(source, use_damaged):
-            total += image if weights is None else weights[i] * image
-            n += 1
-    return total / n if n else None
-
-
 def flats_sentence(source: ScanSource, references: References, by_current: bool) -> str:
     """How changes of the beam and of the exposure were corrected, in words; empty if they were not."""
 
     sentences = []
     if views_differ(source):
-        views = source.exposures[source.image_key == FrameKind.PROJECTION]
+        views = source.table.exposures[source.table.views]
         sentences.append(f"Exposures of the views: {views.min():g} to {views.max():g} s; corrected.")
     if by_current:
-        currents = 1 / current_scale(source)[source.image_key == FrameKind.PROJECTION]
+        currents = 1 / current_scale(source)[source.table.views]
         sentences.append(
             f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
         )
@@ -199,10 +234,10 @@ def flats_sentence(source: ScanSource, references: References, by_current: bool)
 
 def warn_of_parts_without_flats(source: ScanSource, references: References, warn: Warn) -> None:
     """A warning for each part of the scan whose views are corrected by the flats of another part."""
-    starts = source.part_starts
+    starts = source.table.part_starts
     flats = [position for position, _ in references.flats]
-    for start, end in zip(starts, [*starts[1:], source.image_key.size], strict=True):
-        has_views = (source.image_key[start:end] == FrameKind.PROJECTION).any()
+    for start, end in zip(starts, [*starts[1:], len(source.table)], strict=True):
+        has_views = source.table.views_of(start, end).size
         if has_views and not any(start <= position < end for position in flats):
             warn(
                 f"Frames {start}-{end - 1}, a part of the scan, have no usable flats. The "

@@ -15,7 +15,6 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import BlurringStep, ScanPart, ViewFilter
 from beamline.projections.selection import Selection, cone_of
 from beamline.projections.step import StepDone, StepMemory, option
-from drivers.base.frame import FrameKind
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -171,7 +170,7 @@ def with_tilt(
     step.of(source, selection)  # refuses a cone
     if not step.sought:
         return selection, ""
-    rows, frames = source.shape[0] // selection.binning, spread_views(source.angles[frames], _VIEWS, frames)
+    rows, frames = source.shape[0] // selection.binning, spread_views(source.table.angles[frames], _VIEWS, frames)
     try:
         tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, progress)
     except ValueError as error:
@@ -196,7 +195,7 @@ def _search_memory(source: ScanSource, selection: Selection) -> int:
     from beamline.projections.correction import at_once_memory
     from recon.prep.tilt import STEEPEST
 
-    step, frames = selection.step(TiltAndLens), int((source.image_key == FrameKind.PROJECTION).sum())
+    step, frames = selection.step(TiltAndLens), source.table.views.size
     steepest = replace(_without_blur(selection), rows=None).with_steps(replace(step, tilt=math.degrees(STEEPEST)))
     n, cols = min(frames, _VIEWS), source.shape[1] // selection.binning
     rows = source.shape[0] // selection.binning

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import ConfigError
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.readers.base import Attributes, ScanSource, frame_indices, read_known
-from beamline.storage.readers.frames import BY_FRAME, Frames, Read
+from beamline.storage.readers.frames import Frames, Read
 from drivers.base.frame import FrameKind
 
 JOINED_DEG = "frames_per_view_joined_deg"
 """Attribute of a scan whose frames are averaged: the largest angle between two frames of a view."""
+_MEASURED = ("angles", "times", "aside", "shifts", "energies", "currents")
 _EXACT = 2  # bytes of a whole number, whose sums over a view uint32 holds
 
 
@@ -38,31 +41,23 @@ class AveragedSource(Frames):
             base,
             pixels=self._mean,
             dtype=np.dtype(np.float32),
-            numbers=None,
             frames_per_view=n,
             frame_bytes=lambda each: each * n,
-            image_key=self._kinds,
-            **dict.fromkeys(("exposures", "triggers", "framestamps"), lambda known: known[self._first()]),
-            **dict.fromkeys(("angles", *BY_FRAME), self._means),
+            table=self._joined,
             attributes=self._and_joined,
-            flags=lambda flags: None if flags is None else flags.of_groups(self._used),
-            part_starts=lambda starts: np.unique(np.searchsorted(self._first(), starts)),
-            pass_ends=lambda ends: np.searchsorted(self._first(), ends),
             damaged=lambda rows: frozenset(i for i, group in enumerate(self._used) if rows.issuperset(group)),
-            replaces=lambda rows: None,  # such frames are gone
-            altered=frozenset(),
         )
         if base.plan.get("frames_per_view") == n and "angles_deg" in base.plan:
             self.plan = {**base.plan, "angles_deg": base.plan["angles_deg"][::n]}
         if base.finished and not any(len(group) > 1 for group in self._groups):
-            views = int((base.image_key == FrameKind.PROJECTION).sum())
+            views = base.table.views.size
             raise ConfigError(
                 f"--frames-per-view {n}: no two of the {views} projections of {base.path} that follow one another are "
                 "closer in angle than views are. Leave it out. Nothing was read."
             )
 
     def _update(self) -> None:
-        keys, flags = self._base.image_key, self._base.flags
+        keys, flags = self._base.table.kinds, self._base.table.flags
         self._groups += self._since(self._apart(), self._groups[-1][-1] + 1 if self._groups else 0)
         usable = ([row for row in group if keys[row] != FrameKind.INVALID] for group in self._groups)
         self._usable = [rows or group for rows, group in zip(usable, self._groups, strict=True)]
@@ -70,22 +65,38 @@ class AveragedSource(Frames):
         self._used = [[row for row in rows if not alarmed[row]] or rows for rows in self._usable]
         super()._update()
 
-    def _first(self) -> NDArray[np.int64]:
-        """The first row of base of each view."""
-        return np.array([group[0] for group in self._groups], np.int64)
+    def _joined(self, known: FrameTable) -> FrameTable:
+        """The first frame of each view, with the means of what is measured."""
+
+        def means(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+            if values is None:
+                return None
+            return np.array([values[rows].mean(axis=0) for rows in self._used]).reshape(-1, *values.shape[1:])
+
+        table = known.take(np.array([group[0] for group in self._groups], np.int64))
+        measured: dict[str, Any] = {name: means(getattr(known, name)) for name in _MEASURED}
+        return replace(
+            table,
+            kinds=known.kinds[[rows[0] for rows in self._usable]],
+            flags=None if known.flags is None else known.flags.of_groups(self._used),
+            altered=np.zeros(len(table), np.bool_),
+            replaces=None,  # such frames are gone
+            numbers=None,
+            **measured,
+        )
 
     def _apart(self) -> float:
         """Radians from a view's first frame, beyond which a frame belongs to another view."""
-        views = self._base.image_key == FrameKind.PROJECTION
+        table = self._base.table
         planned = np.radians(np.asarray(self._base.plan.get("angles_deg", ()), np.float64))
-        angles = planned if planned.size > self._n else self._base.angles[views]
+        angles = planned if planned.size > self._n else table.angles[table.views]
         steps = np.abs(angles[self._n :] - angles[: -self._n])
         steps = steps[np.isfinite(steps) & (steps > 0)]
         return float(np.median(steps)) * (1 - 0.5 / self._n) if steps.size else np.inf
 
     def _since(self, apart: float, first: int) -> list[list[int]]:
         """The rows of base from `first` on, by view; without those of a view that may still get frames."""
-        keys, angles, groups = self._base.image_key, self._base.angles, list[list[int]]()
+        keys, angles, groups = self._base.table.kinds, self._base.table.angles, list[list[int]]()
         view, may_grow = list[int](), False
         for row in (first + np.flatnonzero(keys[first:] != FrameKind.INVALID)).tolist():
             near = may_grow and keys[row] == FrameKind.PROJECTION and not abs(angles[row] - angles[view[0]]) >= apart
@@ -95,18 +106,9 @@ class AveragedSource(Frames):
             may_grow = bool(keys[row] == FrameKind.PROJECTION) and len(view) < self._n
         return groups[:-1] if may_grow and not self._base.finished else groups
 
-    def _kinds(self, keys: NDArray[np.int32]) -> NDArray[np.int32]:
-        return keys[[rows[0] for rows in self._usable]]
-
-    def _means(self, known: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-        """Values [row] of this scan: means over the frames averaged into each row."""
-        if known is None:
-            return None
-        return np.array([known[rows].mean(axis=0) for rows in self._used]).reshape(-1, *known.shape[1:])
-
     def _and_joined(self, known: Attributes) -> Attributes:
         """The scan's attributes, with how many frames were left out, and the largest angle between two of a view."""
-        angles, out = self._base.angles, sum(map(len, self._usable)) - sum(map(len, self._used))
+        angles, out = self._base.table.angles, sum(map(len, self._usable)) - sum(map(len, self._used))
         joined = float(np.degrees(max((np.ptp(angles[rows]) for rows in self._groups if len(rows) > 1), default=0.0)))
         facts = {"frames_per_view": self._n, "frames_left_out_by_alarms": out, JOINED_DEG: joined}
         return {**known, **{name: value for name, value in facts.items() if value}}
@@ -139,5 +141,4 @@ def stated_frames_per_view(source: ScanSource) -> int:
 
 def angles_of_frames(angles: NDArray[np.float64], source: ScanSource, n: int) -> NDArray[np.float64]:
     """Angles [frame]: if one is given for each view, it applies to the view's n frames."""
-    views = int((source.image_key == FrameKind.PROJECTION).sum())
-    return np.repeat(angles, n) if angles.size * n == views else angles
+    return np.repeat(angles, n) if angles.size * n == source.table.views.size else angles

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.monitor.digest import LARGEST
-from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import Frame, FrameKind
@@ -29,19 +29,21 @@ WHOLE = slice(None)
 
 
 class NotUsed(NamedTuple):
-    """A field of a file that is ignored: its path, its value, why or what to do, and whether it may matter."""
+    """A field of a file that is ignored: its path, its value, why or what to do, whether it may matter, and whether a
+    volume without it is wrong by more than a hundredth."""
 
     where: str
     value: str
     why: str
     doubt: bool
+    wrong: bool = False
 
 
 class ScanSource(ABC):
     """The frames of one scan and their metadata. Nothing is guessed: unknown values are None, NaN or "unknown".
 
-    A format's subclass has `read` and `close`. It sets `path`, `shape`, `dtype`, `image_key`, `angles`, `exposures` and
-    `facts` where it opens the file, and those of the other fields that its format states.
+    A format's subclass has `read` and `close`. It sets `path`, `shape`, `dtype`, `table` and `facts` where it opens the
+    file, and those of the other fields that its format states.
 
     Attributes:
         path: of the opened scan.
@@ -49,9 +51,7 @@ class ScanSource(ABC):
         shape: (rows, cols) of a frame.
         dtype: of the pixels that read() returns.
         quantity: of the pixels. "unknown" if neither the file nor the caller states it.
-        image_key: int32 [frame], values of drivers.base.frame.FrameKind.
-        angles: float64 [frame] radians, NaN where unknown.
-        exposures: float64 [frame] s, NaN where unknown.
+        table: what each frame is; another one after `refresh`.
         facts: `attributes` of a format in which they do not change.
         pixel_size_mm: at the sample; on the detector where the beam is a cone.
         axis_col: rotation axis in 0-based pixel-centre columns.
@@ -63,29 +63,21 @@ class ScanSource(ABC):
         in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
             they were taken.
         untyped: the file does not say whether the bits of pixels are those of whole or of real numbers.
-        numbers: int64 [frame], the number in the name of each frame's file; None where files are not numbered.
         pixel_mask: bool [row, col], pixels that the file says not to use; None where it says nothing.
         frames_per_view: of the camera, that a projection is the mean of; 1: it is one.
         not_used: what the file states of geometry, units, order and validity, and what is not used.
-        energies: float64 [frame] keV, NaN where unknown; None where the file states none of each frame.
-        currents: float64 [frame] of the ring, or another reading of the file's monitor of the beam, in its own unit;
-            NaN where unknown, None where there is no monitor.
         unpack_bytes: bytes of memory that are taken while a frame's part of a compressed file is unpacked.
         plan: the requested scan, as our files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
-        aside_mm: float64 [frame], where the sample stood, as of `Frame.aside`; None: in its place.
-        pass_ends: int64 [pass], rows in the file at the end of each pass of views; empty where the file says none.
         decisions: what was chosen after passes, oldest first: values of the event `next_chosen`.
-        stated_shifts, stated_ending: `shifts` and `ending` of a format in which they do not change.
+        stated_ending: `ending` of a format in which it does not change.
     """
 
     path: Path
     format: str
     shape: tuple[int, int]
     dtype: np.dtype[Any]
-    image_key: NDArray[np.int32]
-    angles: NDArray[np.float64]
-    exposures: NDArray[np.float64]
+    table: FrameTable
     facts: Attributes
     quantity: Quantity = "unknown"
     pixel_size_mm: float | None = None
@@ -98,19 +90,13 @@ class ScanSource(ABC):
     row_pitch_mm: float | None = None
     in_order: bool = True
     untyped: bool = False
-    numbers: NDArray[np.int64] | None = None
     pixel_mask: Mask | None = None
     frames_per_view: int = 1
     not_used: tuple[NotUsed, ...] = ()
-    energies: NDArray[np.float64] | None = None
-    currents: NDArray[np.float64] | None = None
     unpack_bytes: int = 0
     plan: Mapping[str, Any] = MappingProxyType({})
     row_period: float | None = None
-    aside_mm: NDArray[np.float64] | None = None
-    pass_ends: NDArray[np.int64] = np.zeros(0, np.int64)
     decisions: tuple[Mapping[str, Any], ...] = ()
-    stated_shifts: NDArray[np.float64] | None = None
     stated_ending: ScanEnding = ScanEnding()
 
     @property
@@ -139,58 +125,9 @@ class ScanSource(ABC):
         return self.facts
 
     @property
-    def flags(self) -> FrameFlags | None:
-        """The monitor's flags by frame; None if no monitor checked the frames."""
-        return None
-
-    @property
-    def times(self) -> NDArray[np.float64] | None:
-        """float64 [frame], s at the trigger, NaN where unknown; None if the file has no times."""
-        return None
-
-    @property
-    def shifts(self) -> NDArray[np.float64] | None:
-        """float64 [frame, 2], displacement of images along (columns, rows) in pixels, as the file states it.
-
-        NaN in other frames; None where it says nothing.
-        """
-        return self.stated_shifts
-
-    @property
-    def triggers(self) -> NDArray[np.int64]:
-        """int64 [frame], as of `Frame`; -1 where the record of a frame cannot be trusted."""
-        return count_in_blocks(self.image_key)
-
-    @property
-    def framestamps(self) -> NDArray[np.int64]:
-        """int64 [frame], the camera's own counter; -1 where the file has none."""
-        return np.full(self.image_key.size, -1)
-
-    @property
-    def replaces(self) -> NDArray[np.int64] | None:
-        """int64 [frame], the row of the view that a frame repeats (the old row is then INVALID), -1 for other frames.
-
-        None if no view was repeated.
-        """
-        return None
-
-    @property
-    def part_starts(self) -> NDArray[np.int64]:
-        """int64 [part], ascending, the first row of each part; [0] if the scan was not interrupted.
-
-        Between two parts beam and camera may have changed.
-        """
-        return np.zeros(1, np.int64)
-
-    @property
     def checksummed(self) -> bool:
         """Whether the file has a checksum for every frame."""
         return False
-
-    @property
-    def altered(self) -> frozenset[int]:
-        """Rows whose record differs from its checksum. They are INVALID: their metadata cannot be trusted."""
-        return frozenset()
 
     @property
     def damaged(self) -> frozenset[int]:
@@ -212,40 +149,13 @@ class ScanSource(ABC):
 
     def refresh(self) -> int:
         """Read the state of a growing file again; returns the number of readable frames."""
-        return int(self.image_key.size)
+        return len(self.table)
 
     def frames(self, first: int = 0) -> Iterator[Frame]:
-        """The frames from `first` on, each with all that is known of it.
-
-        Raises:
-            DataError: the pixels are not the uint16 that a Frame holds.
-        """
-        self.require_counts()
-        n, triggers, framestamps = self.image_key.size, self.triggers, self.framestamps
-        times = np.full(n, np.nan) if (known := self.times) is None else known
-        replaces = np.full(n, -1) if (rows := self.replaces) is None else rows
-        aside = np.zeros(n) if self.aside_mm is None else np.nan_to_num(self.aside_mm)
-        for i in range(first, n):
-            counts = read_known(self, [i])[0]
-            yield Frame(
-                counts=counts,
-                kind=FrameKind.INVALID if i in self.unreadable else FrameKind(int(self.image_key[i])),
-                index=i,
-                trigger=int(triggers[i]),
-                framestamp=int(framestamps[i]),
-                angle=float(self.angles[i]),
-                time=float(times[i]),
-                exposure=float(self.exposures[i]),
-                replaces=int(replaces[i]),
-                aside=float(aside[i]),
-            )
-
-    def require_counts(self) -> None:
-        """Raise DataError if the pixels are not uint16, as a Frame requires."""
-        if self.dtype != np.uint16:
-            raise DataError(
-                f"{self.path} holds {self.dtype} pixels; a camera's frames are uint16. Read them as arrays instead."
-            )
+        """The frames from `first` on, each with all that is known of it; pixels are of the file's type."""
+        for row in range(first, len(table := self.table)):
+            counts = read_known(self, [row])[0]
+            yield table.frame(row, counts, FrameKind.INVALID if row in self.unreadable else None)
 
     def __enter__(self) -> Self:
         return self
@@ -277,7 +187,7 @@ def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOL
     try:
         return measured(source.read(frames) if rows == WHOLE else source.read(frames, rows))
     except UnreadableError:
-        indices = frame_indices(frames, int(source.image_key.size))
+        indices = frame_indices(frames, len(source.table))
     out = np.zeros((indices.size, len(range(source.shape[0])[rows]), source.shape[1]), source.dtype)
     for image, row in zip(out, indices.tolist(), strict=True):
         try:
@@ -304,19 +214,6 @@ def measured(pixels: NDArray[Any]) -> NDArray[Any]:
 
 class TakesTooLongError(DataError):
     """The check was ended because it would take too long; findings so far are valid."""
-
-
-def count_in_blocks(image_key: NDArray[np.int32]) -> NDArray[np.int64]:
-    """The trigger of each frame within its block: 0, 1, 2, ..., starting at each change of kind."""
-    rows = np.arange(image_key.size)
-    starts = np.where(np.diff(image_key, prepend=image_key[:1] - 1) != 0, rows, 0)
-    return rows - np.maximum.accumulate(starts)
-
-
-def rows_replaced(source: ScanSource) -> NDArray[np.int64]:
-    """Rows of the views that were repeated, ascending."""
-    replaces = source.replaces
-    return np.zeros(0, np.int64) if replaces is None else np.sort(replaces[replaces >= 0])
 
 
 @dataclass(frozen=True)

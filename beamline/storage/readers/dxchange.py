@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.foreign_zarr import open_array_file, zarr_root
+from beamline.storage.array_file import open_array_file, zarr_root
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import NotUsed, Opening, ScanFormat
 from beamline.storage.readers.fields import (
     EXCHANGE,
@@ -22,16 +23,16 @@ from beamline.storage.readers.fields import (
     stated_in,
 )
 from beamline.storage.readers.nexus import differing
-from beamline.storage.readers.stacks import (
+from beamline.storage.readers.orders import (
     SINOGRAM,
     USUAL,
-    FrameStack,
     Order,
-    StacksSource,
     as_frames,
+    dimensions,
     dimensions_without_ones,
     order_of_axes,
 )
+from beamline.storage.readers.stacks import FrameStack, StacksSource
 from drivers.base.frame import FrameKind
 
 _UNKNOWN = "the names are unknown; theta:y:x is taken"
@@ -62,17 +63,17 @@ def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) 
             for kind, where, item in items
             if item is not None
         ]
-        source = ExchangeSource(path, file, stacks, format="data_exchange", facts=_attributes(file))
+        facts = {**_attributes(file), "dimensions": dimensions(usual)}
+        source = ExchangeSource(path, file, stacks, format="data_exchange", facts=facts)
         source.own_angles, source.grows, n_views = own_angles, not source.finished, len(stacks[-1].frames)
         if source.grows:
             source.rows = source.rows[:0]
             source.refresh()
         else:
             if own_angles:
-                source.angles[-n_views:] = _theta(file, n_views)
-            n_flats = int((source.image_key == FrameKind.FLAT).sum())
-            source.take_order(_thetas(file, stacks), _later_flats(file, n_flats))
-            _set_exposures(source, file)
+                source.table.angles[-n_views:] = _theta(file, n_views)
+            source.take_order(_thetas(file, stacks), _later_flats(file, source.table.flats.size))
+            _set_exposures(source.table, file)
         units = datasets.attribute(file["exchange/data"], "units").lower().replace(" ", "_")
         if source.quantity == "unknown" and units in ("counts", "line_integrals"):
             source.quantity = "counts" if units == "counts" else "line_integrals"
@@ -102,11 +103,11 @@ class ExchangeSource(StacksSource):
         angled = hdf5.n_written(theta) if theta is not None else there[-1]
         there[-1] = min(there[-1], angled)
         self.number_frames([len(stack.frames) for stack in self._stacks] if ended else there)
-        views = self.image_key == FrameKind.PROJECTION
+        views = self.table.views
         if self.own_angles:
-            self.angles[views] = _theta(self._file, int(views.sum()), ended)[: views.sum()]
-        _set_exposures(self, self._file)
-        return views.size
+            self.table.angles[views] = _theta(self._file, views.size, ended)[: views.size]
+        _set_exposures(self.table, self._file)
+        return len(self.table)
 
     def take_order(self, thetas: Mapping[FrameKind, NDArray[np.float64]], later: int | None) -> None:
         """Sort darks and flats among the views, if the file says when flats were taken.
@@ -115,25 +116,24 @@ class ExchangeSource(StacksSource):
             thetas: radians at which the darks and the flats were taken, where the file states them.
             later: the first of the flats that were taken after the views; None: the acquisition does not say.
         """
-        kinds = self.image_key
-        views = self.angles[kinds == FrameKind.PROJECTION]
-        place = np.where(kinds == FrameKind.PROJECTION, np.cumsum(kinds == FrameKind.PROJECTION) - 1.0, -1.0)
+        table, place = self.table, np.full(len(self.table), -1.0)
+        views = table.angles[table.views]
+        place[table.views] = np.arange(views.size)
         steps = np.diff(views)
         in_turn = bool((steps > 0).all() or (steps < 0).all())
         for kind, theta in thetas.items() if in_turn else ():
             at = np.abs(views - theta[:, None]).argmin(axis=1)
-            place[kinds == kind] = np.where(at == views.size - 1, views.size, at - 0.5)  # those of the end
+            place[table.of_kind(kind)] = np.where(at == views.size - 1, views.size, at - 0.5)  # those of the end
         turned = np.flatnonzero(np.diff(thetas.get(FrameKind.FLAT, np.zeros(1)))) + 1
         if later is None and not in_turn and turned.size == 1:  # views in any order; flats at two places of the stage
             later = int(turned[0])
         if later is not None:
-            place[np.flatnonzero(kinds == FrameKind.FLAT)[later:]] = views.size
+            place[table.flats[later:]] = views.size
         elif FrameKind.FLAT not in thetas or not in_turn:
             return
         order = np.argsort(place, kind="stable")
-        for name in ("image_key", "angles", "exposures", "rows"):
-            setattr(self, name, getattr(self, name)[order])
-        self.in_order = in_turn and {*kinds.tolist()} <= {*thetas, FrameKind.PROJECTION}
+        self.table, self.rows = FrameTable.of(table.kinds[order], table.angles[order]), self.rows[order]
+        self.in_order = in_turn and {*table.kinds.tolist()} <= {*thetas, FrameKind.PROJECTION}
 
 
 def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> dict[FrameKind, NDArray[np.float64]]:
@@ -161,18 +161,17 @@ def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
     return angles if np.isfinite(angles).all() else None
 
 
-def _set_exposures(source: ExchangeSource, file: h5py.File) -> None:
+def _set_exposures(table: FrameTable, file: h5py.File) -> None:
     """Set exposures: one of all frames, or of each view; and of flats, where the acquisition states another one."""
-    views = source.image_key == FrameKind.PROJECTION
-    seconds = _seconds(file, f"{_DETECTOR}/exposure_time", int(views.sum()))
+    seconds = _seconds(file, f"{_DETECTOR}/exposure_time", table.views.size)
     if seconds is None:
         return
-    source.exposures[views] = seconds
-    source.exposures[~views] = seconds[0] if seconds.size == 1 else np.nan
+    table.exposures[:] = seconds[0] if seconds.size == 1 else np.nan
+    table.exposures[table.views] = seconds
     how = datasets.dataset(file, f"{_FLATS}/different_flat_exposure")
     of_flats = _seconds(file, f"{_FLATS}/flat_exposure_time", 1)
     if of_flats is not None and how is not None and _words(how).lower().startswith("different"):
-        source.exposures[source.image_key == FrameKind.FLAT] = of_flats
+        table.exposures[table.flats] = of_flats
 
 
 def _seconds(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from beamline.core.text import printable
 from beamline.storage import datasets
 from beamline.storage.readers.base import NotUsed, ScanSource
-from drivers.base.frame import FrameKind
 
 Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
 """Whether a value [...] of a dataset may change the volume of a scan that is read without it."""
@@ -25,7 +24,7 @@ Matters = Callable[[NDArray[Any], h5py.Dataset, ScanSource], bool]
 EXCHANGE_LENGTH_UNITS = {**datasets.LENGTH_UNITS, "": 1e3}  # metre without a unit, as the format says
 EXCHANGE_ENERGY_UNITS = {**datasets.ENERGY_UNITS, "": datasets.ENERGY_UNITS["j"]}
 EXCHANGE_TIME_UNITS = {**datasets.TIME_UNITS, "": 1.0}  # seconds without a unit, as the format says
-_HALF_PIXEL = 0.5  # what moves by less is not seen
+_HALF_PIXEL, _WRONG = 0.5, 0.01  # what moves by less is not seen; a share of lengths from which a volume is wrong
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
 
     Numbers that would be used, were their unit known, are among them.
     """
-    views = int((source.image_key == FrameKind.PROJECTION).sum())
+    frames, views = len(source.table), source.table.views
     unused = list[NotUsed]()
     for field in fields:
         item = _dataset(root, field.where, detector) if field.units is not None or not field.used else None
@@ -61,15 +60,17 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
         if item.size * item.dtype.itemsize > datasets.BRIEF:  # no place, time or number of each frame
             unused.append(NotUsed(field.where, f"{' x '.join(map(str, item.shape))} values", "it is too large", False))
             continue
-        value, why, doubt = np.asarray(datasets.values_of(item)), field.use, True
+        value, why, doubt, share = np.asarray(datasets.values_of(item)), field.use, True, 0.0
         if not field.used:
             doubt = field.matters is not None and field.matters(value, item, source)
-        elif value.size not in (1, source.image_key.size, views):
-            why = f"it has {value.size} values, and the scan {source.image_key.size} frames"
+        elif value.size not in (1, frames, views.size):
+            why = f"it has {value.size} values, and the scan {frames} frames"
         else:
-            why = _unit_problem(field, value, item, source) or _varying(field, item, source)
+            varying, share = _varying(field, item, source)
+            why = _unit_problem(field, value, item, source) or varying
         if why:
-            unused.append(NotUsed(field.where, _text(value, datasets.attribute(item, "units")), why, doubt))
+            said = _text(value, datasets.attribute(item, "units"))
+            unused.append(NotUsed(field.where, said, why, doubt, share > _WRONG))
     return tuple(unused)
 
 
@@ -84,16 +85,18 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
     return f"{f'its units {unit!r} are' if unit else 'it has no attribute `units`, which is'} not known here"
 
 
-def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> str:
-    """What one length for all views does, where the file states others for some; "" where that is not seen."""
+def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> tuple[str, float]:
+    """What one length for all views does, where the file states others for some, and their share of it; "" where nobody
+    sees that."""
     lengths = None if field.units is None or "mm" not in field.units else datasets.in_units(item, field.units)
     if lengths is None or lengths.size == 1:
-        return ""
-    lengths = lengths[source.image_key == FrameKind.PROJECTION] if lengths.size == source.image_key.size else lengths
+        return "", 0.0
+    lengths = lengths[source.table.views] if lengths.size == len(source.table) else lengths
     typical = np.median(lengths)
     whole = typical if "pixel_size" in field.where else np.inf if source.cone is None else source.cone[1]
-    moved = float(np.max(np.abs(lengths - typical)) / whole * max(source.shape) / 2)  # px at the edge of the field
-    return _ONE.format(moved) if moved > _HALF_PIXEL else ""
+    share = float(np.max(np.abs(lengths - typical)) / whole)
+    moved = share * max(source.shape) / 2  # px at the edge of the field
+    return (_ONE.format(moved), share) if moved > _HALF_PIXEL else ("", 0.0)
 
 
 def _dataset(root: h5py.Group, where: str, detector: str) -> h5py.Dataset | None:
@@ -120,9 +123,9 @@ def _true(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
 def _moves(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> bool:
     """Places of frames that differ by more than half a pixel between projections, or by anything in an unknown unit."""
     factor = datasets.factor_of(datasets.attribute(item, "units"), datasets.LENGTH_UNITS)
-    if value.dtype.kind not in "uif" or value.size != source.image_key.size:
+    if value.dtype.kind not in "uif" or value.size != len(source.table):
         return False
-    places = value.reshape(-1)[source.image_key == FrameKind.PROJECTION].astype(np.float64)
+    places = value.reshape(-1)[source.table.views].astype(np.float64)
     span = float(np.ptp(places)) if places.size and np.isfinite(places).all() else 0.0
     if factor is None or source.pixel_size_mm is None:
         return span > 0
@@ -140,7 +143,8 @@ def _disagrees(value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> b
 
 _ONE = (
     "it differs from view to view, one value is taken for all, and so images differ in size, by up to {:.2g} px at the "
-    "edge of the field. Scale the images about the rotation axis to one pixel size"
+    "edge of the field. Scale the images about the rotation axis to one pixel size, or say the one that holds with "
+    "--pixel-size-um (of a cone --cone)"
 )
 _POSES = "give the shifts of views with --poses"
 _POINTS = "NeXus does not say where it points on the detector; --poses FILE:x,-y does"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets
-from beamline.storage.readers.stacks import order_of_axes
+from beamline.storage.readers.orders import order_of_axes
 
 _LISTED = 6  # detectors, or lists of angles, that a sentence names
 _LONGEST = 100  # steps of a chain of transformations

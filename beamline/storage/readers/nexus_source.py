@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
-from beamline.storage.readers.base import WHOLE, NotUsed, Quantity, ScanSource, count_in_blocks, frame_indices
+from beamline.storage.frame_table import FrameTable
+from beamline.storage.readers.base import WHOLE, NotUsed, Quantity, ScanSource, frame_indices
 from beamline.storage.readers.fields import NXTOMO, UPRIGHT, stated_in
 from beamline.storage.readers.nexus import (
     Places,
@@ -120,38 +121,37 @@ class NexusSource(ScanSource):
 
     @guarded
     def refresh(self) -> int:
-        places, ended, before = self._places, self.finished, self.n
+        places, ended = self._places, self.finished
         key = datasets.dataset(places.detector, "image_key_control") or places.image_key
         hdf5.look_again(key)
         angle = places.angle if self._own_angles else None
         there = [hdf5.n_written(each) for each in (places.data, angle) if each is not None]
         n = len(places.data) if ended else min(*there, len(key))
-        self._read_rows(key, n, n if ended else np.inf)
-        if n != before:
-            self.energies, self.currents = read_energies(places.entry, n), self._currents()
-        return n
-
-    def _read_rows(self, key: h5py.Dataset, n: int, most: float) -> None:
-        """Kind, angle and exposure of the first n frames. DataError: there are fewer of one of them, or more than
-        `most`."""
-        places = self._places
-        known = places.angle is not None and self._own_angles
-        angles = places.sense * datasets.radians(places.angle) + 0.0 if known else np.full(n, np.nan)  # no -0
+        angles = np.full(n, np.nan) if angle is None else places.sense * datasets.radians(angle) + 0.0  # no -0
         keys = np.ravel(datasets.values_of(key))
         sizes = (int(places.data.shape[0]), keys.size, angles.size)
-        if min(sizes) < n or max(sizes) > most:
+        if min(sizes) < n or (ended and max(sizes) > n):
             raise DataError(
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
-        known = np.isin(keys[:n], list(FrameKind)) & (keys[:n] != FrameKind.WIDE_VIEW)  # which is never written
-        self.image_key = np.where(known, keys[:n], FrameKind.INVALID).astype(np.int32)
-        self._judge_rows(n)
-        self.n, self.angles = n, angles[:n]
-        seconds = self._seconds(places.detector, "count_time")
-        self.exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
-
-    def _judge_rows(self, n: int) -> None:
-        """Correct the kinds of the first n frames by what else the file holds of them: here by nothing."""
+        self.n, known = (
+            n,
+            np.isin(keys[:n], list(FrameKind)) & (keys[:n] != FrameKind.WIDE_VIEW),
+        )  # which is never written
+        seconds, times = self._seconds(places.detector, "count_time"), self._seconds(places.entry, "frame_log/time")
+        exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
+        logged = {f"{name}s": self._column(f"frame_log/{name}") for name in ("trigger", "framestamp")}
+        own = {name: column for name, column in logged.items() if column is not None}
+        self.table = FrameTable.of(
+            np.where(known, keys[:n], FrameKind.INVALID),
+            angles[:n],
+            exposures,
+            times=times if np.isfinite(times).any() else None,
+            energies=read_energies(places.entry, n),
+            currents=self._currents(),
+            **own,
+        )
+        return n
 
     @property
     def frame_bytes(self) -> int:
@@ -171,8 +171,8 @@ class NexusSource(ScanSource):
             number = datasets.scalar(entry, at, units)
             if number is not None:
                 facts[name] = number
-        if "exposure_s" not in facts and np.isfinite(self.exposures).any():
-            facts["exposure_s"] = float(np.nanmedian(self.exposures))
+        if "exposure_s" not in facts and np.isfinite(exposures := self.table.exposures).any():
+            facts["exposure_s"] = float(np.nanmedian(exposures))
         facts |= self._remarks
         where, against = str(getattr(self._places.angle, "name", "")), self._places.sense < 0
         if self._places.angle_problem:
@@ -200,29 +200,6 @@ class NexusSource(ScanSource):
         if turned:
             self.not_used += (NotUsed("detector/transformations", turned, UPRIGHT, True),)
 
-    @property
-    @guarded
-    def times(self) -> NDArray[np.float64] | None:
-        seconds = self._seconds(self._places.entry, "frame_log/time")
-        seconds[[*self.altered]] = np.nan
-        return seconds if np.isfinite(seconds).any() else None
-
-    @property
-    @guarded
-    def triggers(self) -> NDArray[np.int64]:
-        return self._logged("trigger", count_in_blocks(self.image_key))
-
-    @property
-    @guarded
-    def framestamps(self) -> NDArray[np.int64]:
-        return self._logged("framestamp", np.full(self.n, -1))
-
-    def _logged(self, name: str, default: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Whole numbers [frame] of the log, -1 where the record is altered."""
-        rows = self._column(f"frame_log/{name}", default)[: self.n].astype(np.int64)
-        rows[[*self.altered]] = -1
-        return rows
-
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices, (upside_down, left_to_right) = frame_indices(frames, self.n), self._mirrored_by
         kept = range(self.shape[0])[rows]
@@ -245,12 +222,13 @@ class NexusSource(ScanSource):
         """A dataset as it is now; None without it."""
         return datasets.dataset(group, path)
 
-    def _column(self, path: str, default: NDArray[Any]) -> NDArray[Any]:
+    def _column(self, path: str) -> NDArray[np.int64] | None:
+        """Whole numbers [frame]; None where the file has no such list."""
         item = self._item(self._places.entry, path)
-        if item is None:
-            return default
-        values = np.asarray(datasets.values_of(item))
-        return values if values.ndim == 1 and values.size >= self.n and values.dtype.kind in "ui" else default
+        values = None if item is None else np.asarray(datasets.values_of(item))
+        if values is None or values.ndim != 1 or values.size < self.n or values.dtype.kind not in "ui":
+            return None
+        return values[: self.n].astype(np.int64)
 
     def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
         """Seconds of each frame; NaN where the file states none."""

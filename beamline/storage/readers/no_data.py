@@ -35,7 +35,7 @@ def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
     facts = {"pixels_without_data": f"{no_data.mean():.2%}, filled from their neighbours"}
     not_used = tuple(field for field in base.not_used if field.where != "detector/pixel_mask")
     source = Frames(base, pixels=pixels, not_used=not_used, attributes=lambda known: {**known, **facts})
-    counter = not (base.image_key == FrameKind.DARK).any() and counts_photons(source)
+    counter = not base.table.darks.size and counts_photons(source)
     if counter:
         facts["darks"] = "0, as flats vary as counted photons do"
     return source, counter
@@ -68,8 +68,7 @@ def _ends(source: ScanSource) -> list[Mask]:
     """Where some flats and views of all the scan are at the end of their type; [] where one is nowhere."""
     ends = []
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
-        rows = np.flatnonzero(source.image_key == kind)
-        for row in spread(rows, _LOOKED_AT):
+        for row in spread(source.table.of_kind(kind), _LOOKED_AT):
             ends.append(_end_in(source, int(row)))
             if not ends[-1].any():
                 return []
@@ -89,7 +88,7 @@ def counts_photons(source: ScanSource) -> bool:
     Of a camera the variance over the mean is its gain, times the share of the light in its counts, which is less where
     there is less light, as in dark corners: both halves of the pixels must agree.
     """
-    rows = np.flatnonzero(source.image_key == FrameKind.FLAT)[: 2 * _LOOKED_AT]
+    rows = source.table.flats[: 2 * _LOOKED_AT]
     if rows.size < 2 or source.dtype.kind not in "iu":
         return False
     flats = read_known(source, rows).reshape(rows.size, -1).astype(np.float64)

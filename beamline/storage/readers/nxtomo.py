@@ -15,14 +15,14 @@ from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
 from beamline.plan.passes import ended_by
 from beamline.storage import datasets, hdf5
-from beamline.storage.flag_legend import FrameFlags, read_flags
-from beamline.storage.parts import decisions_in, gaps_in, pass_ends_in, require_joined
+from beamline.storage.flag_legend import read_flags
+from beamline.storage.parts import gaps_in, require_joined
 from beamline.storage.readers.base import WHOLE, Opening, ScanFormat, frame_indices
 from beamline.storage.readers.nexus import Places, find
 from beamline.storage.readers.nexus_source import NexusSource, guarded
+from beamline.storage.recorded_frames import decisions_in, frames_in, pass_ends_in
 from beamline.storage.writers import layout
-from beamline.storage.writers.rows import RUNNING, ScanEnding, altered_rows, ending_in, require_earlier
-from drivers.base.frame import FrameKind
+from beamline.storage.writers.rows import RUNNING, ScanEnding, ending_in
 
 
 class OwnScan(NexusSource):
@@ -30,11 +30,10 @@ class OwnScan(NexusSource):
 
     def _read_stated(self, found: list[Places]) -> None:
         self._damaged: set[int] = set()
-        self._altered: set[int] = set()
         self.pixel_size_mm = datasets.scalar(self._places.detector, "x_pixel_size", datasets.LENGTH_UNITS)
         self.cone = self._cone()
-        self.refresh()
         self.plan = json_object(datasets.text_at(self._file, "/entry/record/plan")) or {}
+        self.refresh()
         devices = (self._file.get("/entry/instrument/devices") or {}).values()
         periods = (float(device["row_period"][()]) for device in devices if "row_period" in device)
         self.row_period = next(periods, None)
@@ -57,36 +56,28 @@ class OwnScan(NexusSource):
 
     @guarded
     def refresh(self) -> int:
-        kinds = datasets.dataset(self._places.entry, "frame_log/kind")
-        key = self._places.image_key if kinds is None else kinds
-        n = self._committed(key)
-        self._read_rows(key, n, np.inf)
-        self.pass_ends, self.decisions = pass_ends_in(self._file), decisions_in(self._file)
-        self._checksums = self._column("digest/checksum", np.empty(0))[:n]
+        if (n := self._committed()) > self.n or not n or self.finished:
+            self.n, flags = n, read_flags(self._file, n)
+            known = self.plan or flags.flagged.any()  # a copy has none to say
+            self.table = replace(frames_in(self._file, n), flags=flags if known else None)
+        else:  # of frames that were there nothing else is used before the end
+            self.table = replace(self.table, pass_ends=pass_ends_in(self._file))
+        self.decisions, self._checksums = decisions_in(self._file), self._column("digest/checksum")
         return n
 
-    def _committed(self, key: h5py.Dataset) -> int:
-        """The frames that the writer of our file counts; where they are more than before, their datasets are read
+    def _committed(self) -> int:
+        """The frames that the writer of our file counts; where they are more than before, their pixels are read
         anew."""
-        places, committed = self._places, self._file[layout.COMMITTED]
+        committed = self._file[layout.COMMITTED]
         hdf5.look_again(committed)
         n = int(committed[()])
         if n < 0:
             raise ValueError(f"{n} frames are committed")
         if n > self.n:
-            for item in {places.data, key, places.angle, places.image_key} - {None}:
-                hdf5.look_again(item)
+            hdf5.look_again(self._places.data)
+        if len(self._places.data) < n:
+            raise DataError(f"{self.path} has {len(self._places.data)} frames; expected {n}.")
         return n
-
-    def _judge_rows(self, n: int) -> None:
-        """Alignment frames aside are wide views, and frames whose record is altered are invalid."""
-        if n > self.n:
-            rows = altered_rows(self._file, self.n, n)
-            self._altered |= {self.n + row for row in rows.tolist()}
-        if (moved := self._item(self._places.entry, "sample/x_translation")) is not None:
-            self.aside_mm = datasets.values_of(moved)[:n]
-            self.image_key[(self.image_key == FrameKind.ALIGNMENT) & (self.aside_mm != 0)] = FrameKind.WIDE_VIEW
-        self.image_key[[*self._altered]] = FrameKind.INVALID
 
     @property
     @guarded
@@ -110,28 +101,6 @@ class OwnScan(NexusSource):
         own = {"reason": ending.reason or ended_by(self.decisions)}
         return replace(ending, **({"missing": gaps_in(self.path, self._file)} if ending.status == RUNNING else own))
 
-    @property
-    @guarded
-    def flags(self) -> FrameFlags | None:
-        flags = read_flags(self._file, self.n)
-        return flags if flags is not None and (self.plan or flags.flagged.any()) else None  # a copy has none to say
-
-    @property
-    @guarded
-    def replaces(self) -> NDArray[np.int64] | None:
-        rows = self._logged("replaces", np.full(self.n, -1))
-        require_earlier(rows)
-        return rows if (rows >= 0).any() else None
-
-    @property
-    @guarded
-    def part_starts(self) -> NDArray[np.int64]:
-        item = datasets.dataset(self._file, layout.PART_STARTS)
-        starts = np.zeros(1, np.int64) if item is None else np.ravel(datasets.values_of(item))
-        if starts.dtype.kind not in "iu" or not starts.size or starts[0] != 0 or (starts[1:] <= starts[:-1]).any():
-            raise DataError(f"{self.path}: {layout.PART_STARTS} is {starts}; expected ascending rows, the first 0.")
-        return starts.astype(np.int64)
-
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         indices, height = frame_indices(frames, self.n), len(range(self.shape[0])[rows])
         if 2 * height < self.shape[0] or not self.checksummed:
@@ -143,21 +112,17 @@ class OwnScan(NexusSource):
 
     def _compared(self, row: int) -> NDArray[Any]:
         whole = super().read([row])
-        if not has_checksum(whole[0], int(self._checksums[row])):
+        if self._checksums is not None and not has_checksum(whole[0], int(self._checksums[row])):
             self._damaged.add(int(row))
         return whole[0]
 
     @property
     def checksummed(self) -> bool:
-        return self._checksums.size == self.n > 0
+        return self._checksums is not None and self.n > 0
 
     @property
     def damaged(self) -> frozenset[int]:
         return frozenset(self._damaged)
-
-    @property
-    def altered(self) -> frozenset[int]:
-        return frozenset(self._altered)
 
     def _item(self, group: h5py.Group, path: str) -> h5py.Dataset | None:
         item = datasets.dataset(group, path)

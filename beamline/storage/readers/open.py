@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -15,26 +15,22 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.files import refuse_substitute
 from beamline.storage import datasets, hdf5
-from beamline.storage.foreign_zarr import holds_arrays
+from beamline.storage.array_file import holds_arrays
 from beamline.storage.hdf5 import NotReadyError
+from beamline.storage.readers.angle_files import Angles, angles_at, assign, load_angles, parse_angles, select_rows
 from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
+from beamline.storage.readers.dxchange import FORMAT as EXCHANGE
+from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import open_nxtomo
-from beamline.storage.readers.replacements import (
-    Angles,
-    Images,
-    assign,
-    load_angles,
-    load_images,
-    overlaid,
-    parse_angles,
-    select_rows,
-)
+from beamline.storage.readers.orders import with_order
+from beamline.storage.readers.reference_files import Images, load_images, overlaid, stated_references
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
-from beamline.storage.readers.stacks import angles_at, datasets_text, open_arrays, open_stacks, with_order
+from beamline.storage.readers.stacks import datasets_text, open_stacks
+from beamline.storage.readers.tiff import FOREIGN, no_image
 from beamline.storage.readers.transforms import (
     UNPACKED,
     as_unsigned,
@@ -62,6 +58,7 @@ _PIXELS = 2**27  # of a frame whose rows are all looked at
 REGISTRY = (  # modules in this folder, asked in this order; the first one before those in folders, the others after
     "nxtomo",
     "dxchange",
+    "stacks",
 )
 _OURS = {name: f"beamline.storage.readers.{name}" for name in REGISTRY}
 _MODULES = {REGISTRY[0]: _OURS[REGISTRY[0]], **in_folders("beamline.storage.readers", "FORMATS"), **_OURS}
@@ -210,7 +207,8 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     )
     if angles is not None:
         angles = angles_of_frames(angles, base, n if views is None else views.step or 1)
-        base = Frames(base, angles=assign(base, angles, angles_from, of_views=options.angle_rows is not None))
+        assigned = assign(base, angles, angles_from, of_views=options.angle_rows is not None)
+        base = Frames(base, table=lambda known: replace(known, angles=assigned))
     if views is not None:
         base = selected(base, views)
     if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base, options)) is not None:
@@ -220,7 +218,7 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     flat = np.median(looked[1], axis=0) if len(looked) > 1 else None  # of darks alone it is dim
     wraps = [wrapped_edges(images, images.dtype, flat) for images in looked]
     if any(below for _, below in wraps) and all(below for edges, below in wraps if edges):
-        base = without_wraps(base, sum(edges for edges, _ in wraps))
+        base = without_wraps(base, sum(edges for edges, _ in wraps), max(below for _, below in wraps))
     base = _with_references(base, options, side, replaced=angles is not None)
     if n > 1:
         base = AveragedSource(base, n)
@@ -236,7 +234,9 @@ def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | 
         replaced: the caller states something else of its frames.
     """
     quantity = options.quantity
-    darks, flats = _references(base, options, None if side is None else side.white)
+    darks, flats = stated_references(
+        base, quantity, (options.darks, options.flats), None if side is None else side.white
+    )
     if base.finished and not base.plan and (no_data := no_data_of(base)) is not None:
         base, counts_photons = marked_source(base, no_data)
         darks = np.zeros((1, *base.shape), base.dtype) if darks is None and counts_photons else darks
@@ -258,7 +258,8 @@ def _angle_table(
     origin = str(options.angles) if isinstance(options.angles, Path | str) else "The array of angles"
     if options.angles_path is not None:
         origin = f"{options.angles_path} in {options.path}"
-        table = angles_at(Path(options.path), options.angles_path, options.angles_unit)
+        default = "degrees" if base.format == "data_exchange" else ""
+        table = angles_at(Path(options.path), options.angles_path, options.angles_unit, default)
     if table is None and side is not None and side.angles is not None:
         table, origin = side.angles, str(side.path)
     if table is None and base.angle_text is not None:
@@ -272,42 +273,21 @@ def _angle_table(
 
 
 def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
-    """The detector of an NXtomo whose frames these are, or a scan of these stacks."""
-    if options.darks_path is None and options.flats_path is None and not holds_arrays(path):
+    """The detector of an NXtomo whose frames these are, the scan of Data Exchange, or a scan of these stacks."""
+    own_angles, alone = (
+        options.angles is None and options.angles_path is None,
+        not (options.darks_path or options.flats_path),
+    )
+    if alone and data.strip("/") == "exchange/data" and EXCHANGE.recognises(path, Opening()):
+        return open_exchange(path, own_angles=own_angles)
+    if alone and not holds_arrays(path):
         with hdf5.open_hdf5(path) as file:
             named = datasets.dataset(file, data)
             keyed = named is not None and any(places.data == named for places in find(file))
         if keyed:
-            return open_nxtomo(path, own_angles=options.angles is None and options.angles_path is None, data=data)
+            return open_nxtomo(path, own_angles=own_angles, data=data)
     of_views = options.angles_path if options.angle_rows is None else None
     return open_stacks(path, data, options.darks_path, options.flats_path, of_views)
-
-
-def _references(base: ScanSource, options: SourceOptions, white: float | None) -> tuple[Images | None, Images | None]:
-    """The darks and flats that replace the scan's, of 0 and 1 for transmission; None: its own.
-
-    Args:
-        white: counts of the open beam by the maker's file.
-
-    Raises:
-        DataError: what is no transmission.
-    """
-    nothing = np.zeros((1, *base.shape), base.dtype)
-    if options.quantity != "transmission":
-        if white is None or base.dtype.kind not in "ui":
-            return options.darks, options.flats
-        flats = np.full_like(nothing, white) if options.flats is None else options.flats
-        return nothing if options.darks is None else options.darks, flats
-    if options.darks is not None or options.flats is not None:
-        raise DataError(
-            "--quantity transmission means that frames are already divided by flats: leave out --darks and --flats."
-        )
-    if base.dtype.kind != "f":
-        raise DataError(
-            f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
-            "stands for 1, give an image of it with --flats, one of 0 with --darks, and leave out --quantity."
-        )
-    return nothing, np.ones_like(nothing)
 
 
 def _true_type(source: ScanSource, options: SourceOptions) -> np.dtype[Any] | None:
@@ -326,7 +306,7 @@ def _true_type(source: ScanSource, options: SourceOptions) -> np.dtype[Any] | No
 
 def _some_of_each_kind(source: ScanSource) -> Iterator[NDArray[Any]]:
     for kind in (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK):
-        rows = np.flatnonzero(source.image_key == kind)
+        rows = source.table.of_kind(kind)
         if rows.size:
             some = spread(rows, _LOOKED_AT)
             every = max(1, source.shape[0] * source.shape[1] // _PIXELS, source.frame_bytes // UNPACKED)
@@ -342,11 +322,13 @@ def _open(path: Path, opening: Opening) -> ScanSource:
             if kind.recognises(path, opening):
                 return kind.open(path, opening)
         if holds_arrays(path):
-            return open_arrays(path)
+            return open_stacks(path, None)
+    if path.suffix.lower() in FOREIGN:
+        raise DataError(no_image(path, [path.name]))
     if not hdf5.is_hdf5(path):
         raise DataError(
-            f"{path} is neither HDF5 nor TIFF, nor a .txrm, .npy or Zarr; a scan is one of these, or a folder or .zip "
-            "of one or more images."
+            f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a "
+            f"folder or .zip of one or more images.{_WAYS.get(path.suffix.lower(), '')}"
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
@@ -362,6 +344,10 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         f"{path} holds no scan of a format that is read: {known}. {held} Name those of the scan: --data-path, "
         "--angles-path, --darks-path, --flats-path."
     )
+
+
+_VOLUME = " It may be a volume: `beamline view` shows those of NIfTI."
+_WAYS = {".mat": " Save a .mat with -v7.3.", ".nii": _VOLUME, ".gz": _VOLUME}
 
 
 def scan_format(path: Path) -> str | None:

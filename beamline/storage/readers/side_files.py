@@ -24,7 +24,6 @@ from beamline.core.files import SETTINGS, decoded, require_regular
 from beamline.core.text import NUMBER, with_points
 from beamline.storage.readers.base import NotUsed, ScanSource
 from beamline.storage.readers.frames import Frames
-from drivers.base.frame import FrameKind
 
 _MOST = 20  # files beside a scan that are looked at
 
@@ -123,7 +122,7 @@ def with_side_file(base: ScanSource, side: SideFile) -> ScanSource:
     """A scan with the distances and the pixel size of a vendor's file; DataError where that has another number of
     projections.
     """
-    views = int((base.image_key == FrameKind.PROJECTION).sum())
+    views = base.table.views.size
     if views != side.count:
         raise DataError(f"{side.path} describes {side.count} projections; {base.path} has {views}.")
     return Frames(
@@ -157,7 +156,7 @@ def side_of(source: ScanSource) -> SideFile | None:
     """The vendor's file in or beside a folder of images, or a TIFF, if exactly one has as many projections."""
     if not source.format.startswith("tiff"):
         return None
-    views, found = int((source.image_key == FrameKind.PROJECTION).sum()), []
+    views, found = source.table.views.size, []
     for path in _candidates(source.path):
         with suppress(DataError):
             found.append(read_side_file(path))

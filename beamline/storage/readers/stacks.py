@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,90 +18,23 @@ from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
-from beamline.storage.datasets import bytes_unpacked
-from beamline.storage.foreign_zarr import ArrayFile, NamedArray, open_array_file
-from beamline.storage.readers.base import WHOLE, Attributes, ScanSource, frame_indices
-from beamline.storage.readers.frames import Frames, Read
+from beamline.storage.array_file import ArrayFile, NamedArray, open_array_file
+from beamline.storage.frame_table import FrameTable
+from beamline.storage.readers.base import WHOLE, Attributes, Opening, ScanFormat, ScanSource, frame_indices
+from beamline.storage.readers.nexus import differing
+from beamline.storage.readers.orders import (
+    Order,
+    TurnedFrames,
+    as_frames,
+    dimensions,
+    dimensions_without_ones,
+    order_by_shapes,
+    order_of_axes,
+    stated_order,
+)
 from beamline.storage.superblock import marked_as_being_written
-from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
-
-Order = tuple[int | None, int | None, int | None]
-"""Which dimensions of an array are frames, rows and columns; None: one of length one that it does not have."""
-
-
-class TurnedFrames:
-    """An array of any dimensions, read as [frame, row, col]. Dimensions that are none of these have length one."""
-
-    def __init__(self, item: Any, order: Order) -> None:
-        self.item, self._order = item, order
-        self.dtype, self.ndim, self.name, self.file, self.chunks = item.dtype, 3, item.name, item.file, item.chunks
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return tuple(1 if axis is None else int(self.item.shape[axis]) for axis in self._order)
-
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes that are decompressed to read a frame."""
-        return bytes_unpacked(self.item, self._order[0])
-
-    def __len__(self) -> int:
-        return int(self.shape[0])
-
-    def __getitem__(self, wanted: tuple[slice, ...]) -> NDArray[Any]:
-        stored, parts = [slice(None)] * self.item.ndim, (*wanted, WHOLE, WHOLE)[:3]
-        for axis, part in zip(self._order, parts, strict=True):
-            if axis is not None:
-                stored[axis] = part
-        values, axes = np.asarray(self.item[tuple(stored)]), [axis for axis in self._order if axis is not None]
-        values = values.transpose([*axes, *({*range(values.ndim)} - {*axes})])
-        sizes = [1 if axis is None else values.shape[axes.index(axis)] for axis in self._order]
-        return values.reshape(sizes)[
-            tuple(part if axis is None else WHOLE for axis, part in zip(self._order, parts, strict=True))
-        ]
-
-
-def order_of_axes(axes: Sequence[str]) -> Order | None:
-    """Which of two or three named dimensions are frames, rows and columns; None if the names do not tell.
-
-    x, u or columns; y, v or rows; another one, whatever its name (theta, rotation_angle), are frames.
-    """
-    names = [axis.strip().lower() for axis in axes]
-    cols = [i for i, name in enumerate(names) if name[:1] in ("x", "u") or name.startswith("col")]
-    rows = [i for i, name in enumerate(names) if name[:1] == "y" or (name.startswith(("v", "row")) and name != "view")]
-    frames = [i for i in range(len(names)) if i not in cols + rows]
-    if len(names) not in (2, 3) or len(cols) != 1 or len(rows) > 1 or len(frames) > 1:
-        return None
-    return (*frames, None)[0], (*rows, None)[0], cols[0]
-
-
-USUAL = (0, 1, 2)
-SINOGRAM = (0, None, 1)
-"""The order of one sinogram [view, col]."""
-
-
-def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
-    """The n dimensions of a shape: place and length. Others, where there are more, have length one: the last one, which
-    no column of pixels is, or the first of them."""
-    sizes = dict(enumerate(shape))
-    while len(sizes) > n and 1 in sizes.values():
-        last = max(sizes)
-        del sizes[last if sizes[last] == 1 else next(axis for axis, size in sizes.items() if size == 1)]
-    return sizes
-
-
-def as_frames(item: Any, order: Order = USUAL) -> Any:
-    """An array as frames [frame, row, col]; also one image, which has no dimension of frames."""
-    n = 3 - order.count(None)
-    if isinstance(item, h5py.Dataset) and order == USUAL and item.ndim == n:
-        return item
-    places = [*dimensions_without_ones(item.shape, n)]
-    if len(places) == n - 1 and (frames := order[0]) is not None:
-        order = (None, *(axis if axis is None else axis - (axis > frames) for axis in order[1:]))  # type: ignore[assignment]
-    elif len(places) != n:
-        return item
-    return TurnedFrames(item, tuple(axis if axis is None else places[axis] for axis in order))  # type: ignore[arg-type]
+from recon.base.arrays import F64
 
 
 @dataclass(frozen=True)
@@ -145,8 +78,7 @@ class StacksSource(ScanSource):
         had = np.bincount(self.rows[:, 0], minlength=len(sizes))
         new = [(stack, place) for stack, n in enumerate(sizes) for place in range(had[stack], n)]
         self.rows = np.r_[self.rows, np.array(new, np.int64).reshape(-1, 2)]
-        self.image_key = np.array([stack.kind for stack in self._stacks], np.int32)[self.rows[:, 0]]
-        self.angles, self.exposures = np.full((2, len(self.rows)), np.nan)
+        self.table = FrameTable.of(np.array([stack.kind for stack in self._stacks])[self.rows[:, 0]])
 
     @property
     def finished(self) -> bool:
@@ -173,7 +105,7 @@ class StacksSource(ScanSource):
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the requested frames, in that order; darks and flats are cast to dtype."""
-        indices = frame_indices(frames, self.image_key.size)
+        indices = frame_indices(frames, len(self.table))
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for number, stack in enumerate(self._stacks):
             wanted = np.flatnonzero(self.rows[indices, 0] == number)
@@ -194,13 +126,15 @@ class StacksSource(ScanSource):
         self._file.close()
 
 
-def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, angles: str | None = None) -> StacksSource:
+def open_stacks(
+    path: Path, data: str | None, darks: str | None = None, flats: str | None = None, angles: str | None = None
+) -> StacksSource:
     """The scan whose arrays have these paths in an HDF5 file, a Zarr or an .npy. A dark or flat may be a single
     image [row, col].
 
     Args:
-        data: of the projections; their dimensions may follow it, as in `/images:view,col,row`, and those of darks and
-            flats are in the same order.
+        data: of the projections, None: the only array of images. Their dimensions may follow it, as in
+            `/images:view,col,row`, and those of darks and flats are in the same order.
         angles: of the angles of the projections alone, whose number helps to tell which dimension is that of the views.
 
     Raises:
@@ -208,131 +142,106 @@ def open_stacks(path: Path, data: str, darks: str | None, flats: str | None, ang
     """
     file = open_array_file(path)
     with hdf5.closed_on_error(file):
-        views, where, order = _named_order(file, data)
+        views, where, order = _named_order(file, _only_images(file) if data is None else data)
         given = ((FrameKind.DARK, darks), (FrameKind.FLAT, flats))
         references = [(kind, name, dataset_at(file, name)) for kind, name in given if name is not None]
         n_angles = None if angles is None else dataset_at(file, angles).size
         shapes = [
             tuple(dimensions_without_ones(item.shape).values()) for item in (views, *(item for *_, item in references))
         ]
-        order = order or _order_by_shapes(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
+        order = order or order_by_shapes(shapes[0], shapes[1:], n_angles, matlab="MATLAB_class" in views.attrs)
         stacks = [FrameStack(kind, name, as_frames(item, order)) for kind, name, item in references]
         stacks.append(FrameStack(FrameKind.PROJECTION, where, as_frames(views, order)))
-        names = [("frame", "row", "col")[order.index(axis)] for axis in USUAL if axis in order]
-        facts = {"data": where, "dimensions": ",".join(names)}
+        facts = {"data": where, "dimensions": dimensions(order)}
         stored = isinstance(file, h5py.File)
         source = StacksSource(path, file, stacks, format="hdf5_stacks" if stored else "arrays", facts=facts)
-        config = datasets.resolve(views.parent.parent, "config") if stored and "pixel_size_h" in views.attrs else None
-        if isinstance(config, h5py.Group):
-            _take_geometry(source, float(views.attrs["pixel_size_h"]), config)
+        lists = [item.name for item in arrays_of(file) if item.ndim == 1 and item.size == len(stacks[-1].frames)]
+        if lists and angles is None:
+            source.facts = {**facts, "angles": f"--angles-path {lists[0]} takes those of {', '.join(lists[:_LISTED])}"}
+        _take_geometry(source, views)
         return source
 
 
-def _take_geometry(source: StacksSource, pixel_mm: float, config: h5py.Group) -> None:
-    """Take the pixel size, the distances of a cone and where its central ray falls as CIL writes them, taken as mm."""
-    source.pixel_size_mm = pixel_mm
-    places = [datasets.dataset(config, f"{name}/{what}") for name, what in _CIL]
-    if None not in places:
-        start, axis, end, across, up = (np.asarray(datasets.values_of(place), np.float64) for place in places)
-        normal = np.cross(across, up)
-        normal *= np.sign(normal @ (end - start))
+def _take_geometry(source: StacksSource, views: Any) -> None:
+    """Take the geometry that CIL states beside `views`, the dataset of the projections; lengths in mm.
+
+    CIL turns the object by its angles counter-clockwise about the axis, which is the beam turned by their negative (its
+    `convert_geometry_to_astra_vec_3D`). Here the view turns by θ in the frame of the detector: columns, beam, rows.
+    """
+    config = datasets.resolve(views.parent.parent, "config") if isinstance(views, h5py.Dataset) else None
+    if not isinstance(config, h5py.Group) or "pixel_size_h" not in views.attrs:
+        return
+    source.pixel_size_mm, height = (float(views.attrs.get(f"pixel_size_{side}", np.nan)) for side in "hv")
+    source.row_pitch_mm = differing(height if np.isfinite(height) else None, source.pixel_size_mm)
+    pitch = np.array([source.row_pitch_mm or source.pixel_size_mm, source.pixel_size_mm])
+    across, up, beam = _frame(config)
+    end, axis = (_vector(config, f"{name}/position", (0, 0, 0)) for name in ("detector", "rotation_axis"))
+    middle, plane = (np.array(source.shape) - 1) / 2, np.array([up, across])
+    if datasets.dataset(config, "source/position") is not None:
+        start, normal = _vector(config, "source/position", (0, 0, 0)), np.cross(across, up)
+        normal *= np.sign(normal @ beam)
         source.cone = float(normal @ (axis - start)), float(normal @ (end - start))
-        foot = start + source.cone[1] * normal - end  # from the middle of the detector
-        middle = (np.array(source.shape) - 1) / 2
-        source.central_ray = tuple((middle + np.array([foot @ up, foot @ across]) / pixel_mm).tolist())
+        foot = start + source.cone[1] * normal  # of the central ray
+        source.central_ray = tuple((middle + plane @ (foot - end) / pitch).tolist())
+        axis = start + (axis - start) * source.cone[1] / source.cone[0]
+    source.axis_col = float((middle + plane @ (axis - end) / pitch)[1])
+    angles = datasets.dataset(config, "angles")
+    if angles is not None and angles.size == len(source.table):
+        source.table = replace(source.table, angles=turned(angles, datasets.radians(angles), ""))
 
 
-_CIL = (
-    ("source", "position"),
-    ("rotation_axis", "position"),
-    *(("detector", of) for of in ("position", "direction_x", "direction_y")),
-)
+def turned(item: Any, angles: F64, unit: str | None) -> F64:
+    """Radians of views in the frame of their detector, from those of CIL's object; others as they are.
+
+    Args:
+        angles: the values of `item` in radians.
+        unit: of them, where the caller says another one than the file.
+    """
+    config = item.parent if isinstance(item, h5py.Dataset) else None
+    if config is None or datasets.dataset(config, "detector/direction_x") is None:
+        return angles
+    across, up, beam = _frame(config)
+    sense = -np.sign(np.linalg.det([across, beam, up]) * (_vector(config, "rotation_axis/direction", (0, 0, 1)) @ up))
+    factor = datasets.factor_of(unit or datasets.attribute(item, "angle_unit"), datasets.ANGLE_UNITS) or 0.0
+    return np.asarray(sense * (angles + float(item.attrs.get("initial_angle", 0)) * factor)) + 0.0  # no -0
 
 
-def open_arrays(path: Path) -> StacksSource:
-    """The scan in an .npy or a Zarr with one array of images. DataError: it holds several such, or none."""
-    with closing(ArrayFile(path)) as file:
-        images = [name for name, item in file.items() if item.ndim > 1]
-        if len(images) != 1:
-            raise DataError(
-                f"{path} holds {len(images)} arrays that may be images. {datasets_text(file)} Name those of the scan: "
-                "--data-path, --angles-path, --darks-path, --flats-path."
-            )
-    return open_stacks(path, images[0], None, None)
+def _frame(config: h5py.Group) -> tuple[F64, F64, F64]:
+    """Along which columns, rows and the beam run."""
+    origin = datasets.attribute(datasets.resolve(config.parent, "data/data") or config, "panel_origin")
+    across = _vector(config, "detector/direction_x", (1, 0, 0)) * (-1 if "right" in origin else 1)
+    up = _vector(config, "detector/direction_y", (0, 0, 1)) * (-1 if "top" in origin else 1)
+    if datasets.dataset(config, "source/position") is None:
+        return across, up, _vector(config, "ray/direction", (0, 1, 0))
+    end, start = (_vector(config, f"{name}/position", (0, 0, 0)) for name in ("detector", "source"))
+    return across, up, end - start
+
+
+def _vector(config: h5py.Group, where: str, default: tuple[float, ...]) -> F64:
+    """(x, y, z); of two dimensions, z is 0."""
+    item = datasets.dataset(config, where)
+    values = np.ravel(default if item is None else datasets.values_of(item)).astype(np.float64)
+    return np.pad(values[:3], (0, 3 - min(values.size, 3)))
+
+
+def _only_images(file: ArrayFile) -> str:
+    """The name of the one array that may be images. DataError: there are several, or none."""
+    images = [name for name, item in file.items() if item.ndim > 1]
+    if len(images) != 1:
+        raise DataError(
+            f"{file.filename} holds {len(images)} arrays that may be images. {datasets_text(file)} Name those of the "
+            "scan: --data-path, --angles-path, --darks-path, --flats-path."
+        )
+    return images[0]
 
 
 def _named_order(file: Any, data: str) -> tuple[Any, str, Order | None]:
     """The dataset of the projections, its path, and which of its dimensions are frames, rows and columns, if stated."""
     where, colon, names = data.rpartition(":")
-    if not colon or datasets.dataset(file, data) is not None:
-        return dataset_at(file, data), data, None
-    return dataset_at(file, where), where, stated_order(names)
-
-
-def stated_order(names: str) -> Order:
-    """The order that a caller states, as in "row,view,col". DataError for another text."""
-    if (order := order_of_axes(names.split(","))) is None:
-        raise DataError(
-            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or view,col of "
-            "a sinogram."
-        )
-    return order
-
-
-def _order_by_shapes(
-    views: tuple[int, ...], references: list[tuple[int, ...]], n_angles: int | None, *, matlab: bool
-) -> Order:
-    """Which dimensions are frames, rows and columns, by the shapes of the references and the number of angles.
-
-    MATLAB's first dimension is the last one here, and an image of its has rows before columns. Its stacks with the
-    views in the middle are sinograms, as ASTRA has them, with columns first.
-    """
-    if len(views) != 3:
-        lines = len(views) == 2 and any(shape[-1:] == views[-1:] and shape != views for shape in references)
-        return SINOGRAM if lines else USUAL
-    images = [(*views[:axis], *views[axis + 1 :]) for axis in USUAL]
-    fitting = [
-        axis
-        for axis in USUAL
-        if all(images[axis] in (shape, (*shape[:axis], *shape[axis + 1 :])) for shape in references)
-    ]
-    frames = next((axis for axis in fitting if views[axis] == n_angles), fitting[0] if fitting else 0)
-    rows, cols = (axis for axis in USUAL if axis != frames)
-    return (frames, cols, rows) if matlab and frames != 1 else (frames, rows, cols)
-
-
-def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy, a list or a column.
-
-    Args:
-        where: "": the only list whose unit is one of angles, or the only array.
-        unit: "deg" or "rad", whatever the file says; None: as it says, or `default` where it says none.
-
-    Raises:
-        DataError: it is not there, is no list, or nothing says its unit.
-    """
-    with closing(open_array_file(path)) as file, hdf5.readable(path):
-        if not where and isinstance(file, h5py.File):
-            where = _only_angles(file)
-        item = dataset_at(file, where)
-        if item.ndim == 0 or item.size != max(item.shape):
-            raise DataError(f"{item.name} in {path} has the shape {item.shape}; expected a list of angles.")
-        return datasets.radians(item, unit, default)
-
-
-def _only_angles(file: h5py.File) -> str:
-    """The path of the only list of a file whose unit is one of angles."""
-    names = [
-        str(item.name)
-        for item in _arrays_of(file)
-        if item.ndim == 1 and datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)
-    ]
-    if len(names) != 1:
-        raise DataError(
-            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the right one: "
-            "--angles FILE::DATASET; where it states no unit, also --angles-unit deg or rad."
-        )
-    return names[0]
+    if colon and datasets.dataset(file, data) is None:
+        return dataset_at(file, where), where, stated_order(names)
+    item = dataset_at(file, data)
+    return item, data, order_of_axes([datasets.text(item.attrs.get(f"dim{axis}", "")) for axis in range(item.ndim)])
 
 
 def dataset_at(file: Any, where: str) -> Any:
@@ -346,7 +255,7 @@ def dataset_at(file: Any, where: str) -> Any:
 
 def datasets_text(file: Any) -> str:
     """A sentence on the datasets of a file and their shapes, the largest first."""
-    arrays = sorted(_arrays_of(file), key=lambda item: (-item.ndim, -item.size))
+    arrays = sorted(arrays_of(file), key=lambda item: (-item.ndim, -item.size))
     shapes = [f"{item.name} ({' x '.join(map(str, item.shape))})" for item in arrays[:_LISTED]]
     more = f" and {len(arrays) - _LISTED} more" if len(arrays) > _LISTED else ""
     return f"It has {', '.join(shapes)}{more}." if shapes else "It has no arrays."
@@ -355,7 +264,7 @@ def datasets_text(file: Any) -> str:
 _LISTED = 10  # datasets of a file that an error names
 
 
-def _arrays_of(file: Any) -> list[Any]:
+def arrays_of(file: Any) -> list[Any]:
     if isinstance(file, ArrayFile):
         return [*file.values()]
     arrays = list[h5py.Dataset]()
@@ -363,61 +272,15 @@ def _arrays_of(file: Any) -> list[Any]:
     return arrays
 
 
-def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> ScanSource:
-    """A scan whose images, one after the other, have the dimensions that `order` names, such as "row,view,col".
-
-    Args:
-        order: None: the images are views, but for a single one that has as many rows, or columns, as there are angles:
-            it is a sinogram.
-
-    Raises:
-        DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
-    """
-    fits = [axis for axis, n in enumerate(base.shape) if n == n_angles]
-    if order is None and (base.image_key.size != 1 or n_angles == 1 or not fits):
-        return base
-    if order is None and len(fits) > 1:
-        raise DataError(
-            f"{base.path} holds one image of {n_angles} x {n_angles} pixels, a sinogram by its {n_angles} angles: "
-            "whether its rows or its columns are the views is not known. Give --order view,col or --order col,view."
-        )
-    order = order or ("col,view" if fits[0] else "view,col")
-    images = as_frames(_ImageStack(base), stated_order(order))
-    if not isinstance(images, TurnedFrames) or (base.image_key != FrameKind.PROJECTION).any():
-        raise DataError(
-            f"--order {order} does not fit {base.path}, {base.image_key.size} images of {base.shape[0]} x "
-            f"{base.shape[1]} pixels. It names each dimension, and all images must be of the sample: give darks and "
-            "flats with --darks and --flats."
-        )
-
-    def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
-        indices = frame_indices(frames, len(images))
-        out = np.empty((indices.size, len(range(images.shape[1])[rows]), images.shape[2]), base.dtype)
-        datasets.read_frames(images, indices, rows, out)
-        return out
-
-    unknown = np.full(len(images), np.nan)
-    return Frames(
-        base,
-        pixels=pixels,
-        image_key=np.zeros(len(images), np.int32),
-        angles=unknown,
-        exposures=unknown,
-        shape=images.shape[1:],
-        numbers=None,
-        in_order=True,
-        ending=ScanEnding(),
-        frame_bytes=base.frame_bytes * base.image_key.size,
-        attributes=lambda known: {**known, "dimensions": order},
-    )
+_CIL = "entry1/tomo_entry/data/data"
 
 
-class _ImageStack:
-    """All images of a scan as an array [image, row, col]."""
+def _recognises(path: Path, opening: Opening) -> bool:
+    if not (path.is_file() and hdf5.is_hdf5(path)):
+        return False
+    with closing(hdf5.open_hdf5(path, opening.follow)) as file:
+        data = datasets.resolve(file, _CIL)
+        return isinstance(data, h5py.Dataset) and datasets.attribute(data, "data_type") == "AcquisitionData"
 
-    def __init__(self, base: ScanSource) -> None:
-        self.shape, self.dtype, self.ndim = (base.image_key.size, *base.shape), base.dtype, 3
-        self.name, self.file, self.chunks, self._read = str(base.path), None, None, base.read
 
-    def __getitem__(self, part: tuple[slice, slice, slice]) -> NDArray[Any]:
-        return self._read(part[0], part[1])[..., part[2]]
+FORMAT = ScanFormat("a scan of CIL", _recognises, lambda path, opening: open_stacks(path, _CIL))

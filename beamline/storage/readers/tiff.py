@@ -6,7 +6,6 @@ import logging
 import lzma
 import math
 import re
-import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
@@ -27,10 +26,7 @@ from beamline.storage.structure import PACKED, is_blank
 _MOST_PAGES = 100_000
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
-UNREADABLE = (
-    *(*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, zipfile.BadZipFile),
-    Image.DecompressionBombError,
-)
+UNREADABLE = (*(*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, Image.DecompressionBombError),)
 """What tifffile, zipfile, Pillow and their decoders raise for a file that they cannot read; none of ours is among
 them."""
 _NO_IMAGE = 1 | 4  # bits of NewSubfileType: an image of reduced resolution, a mask
@@ -142,13 +138,7 @@ DECODERS: dict[str, Callable[..., NDArray[Any]]] = {
     ".png": _of_png,
 }
 """How the images of a folder are read, by suffix: each takes an open file, and the bytes that it may unpack to."""
-FOREIGN = (
-    ".jpg",
-    ".jpeg",
-    ".bmp",
-    ".gif",
-    ".jp2",
-)  # pictures that are not read: nearly all of them have 8 bits, or losses
+FOREIGN = ".jpg", ".jpeg", ".bmp", ".gif", ".jp2"  # pictures that are not read: nearly all have 8 bits, or losses
 
 
 def images_among(names: Sequence[str]) -> list[str]:
@@ -159,13 +149,13 @@ def images_among(names: Sequence[str]) -> list[str]:
 
 
 def no_image(path: Path, names: Sequence[str]) -> str:
-    """A sentence on a folder without images that are read."""
+    """A sentence on a folder without images that are read, or on a picture that is not."""
     foreign = next((name for name in names if name.lower().endswith(FOREIGN)), None)
     if foreign is None:
         return f"{path} holds no image: no .tif, .tiff, .npy or .png file."
     return (
-        f"{path} holds pictures such as {foreign}, which are not read: their 8 bits, or what their compression leaves "
-        "out, spoil line integrals. Export 16-bit TIFF or PNG from the program that has the frames. Where there is "
+        f"{path}: pictures such as {foreign} are not read: their 8 bits, or what their compression leaves out, spoil "
+        "line integrals. Export 16-bit TIFF or PNG from the program that has the frames. Where there is "
         "nothing else, in the folder: python -c \"from PIL import Image; import glob; [Image.open(n).convert('L')"
         f".save(n + '.png') for n in glob.glob('*{foreign[foreign.rfind('.') :]}')]\" writes PNG, which is read."
     )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import WHOLE, ScanSource, TakesTooLongError, frame_indices
 from beamline.storage.readers.frames import Frames, Read
 from drivers.base.frame import FrameKind
@@ -26,7 +26,7 @@ def brief_source(base: ScanSource, over: Callable[[], bool]) -> ScanSource:
     """
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
-        n = frame_indices(frames, int(base.image_key.size)).size * len(range(base.shape[0])[rows])
+        n = frame_indices(frames, len(base.table)).size * len(range(base.shape[0])[rows])
         if over() or base.frame_bytes > UNPACKED or n * base.shape[1] * base.dtype.itemsize > _READ:
             raise TakesTooLongError(
                 "Not all frames were looked at that show what is wrong with a scan: it would take too long. `beamline "
@@ -48,11 +48,12 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
     if not 0 <= first < end <= base.shape[1]:
         raise ConfigError(f"--cols {first}:{end} is out of range: the detector has columns 0:{base.shape[1]}.")
 
-    def moved(flags: FrameFlags | None) -> FrameFlags | None:
-        if flags is None:
-            return None
+    def moved(table: FrameTable) -> FrameTable:
+        if (flags := table.flags) is None:
+            return table
         there = flags.regions[..., :1] >= 0  # below 0: no region
-        return replace(flags, regions=flags.regions - np.where(there, [0, 0, first, first], 0).astype(np.int32))
+        regions = flags.regions - np.where(there, [0, 0, first, first], 0).astype(np.int32)
+        return replace(table, flags=replace(flags, regions=regions))
 
     return Frames(
         base,
@@ -61,7 +62,7 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
         shape=(base.shape[0], end - first),
         axis_col=None if base.axis_col is None else base.axis_col - first,
         central_ray=None if base.central_ray is None else (base.central_ray[0], base.central_ray[1] - first),
-        flags=moved,
+        table=moved,
     )
 
 
@@ -73,7 +74,7 @@ def turned(base: ScanSource) -> ScanSource:
     Raises:
         DataError: a scan with flags, which has a vertical axis.
     """
-    if base.flags is not None:
+    if base.table.flags is not None:
         raise DataError(f"{base.path} is a scan with a vertical rotation axis. Leave out --horizontal-axis.")
     sizes = (base.pixel_size_mm, None) if base.row_pitch_mm is None else (base.row_pitch_mm, base.pixel_size_mm)
     return Frames(
@@ -86,7 +87,7 @@ def turned(base: ScanSource) -> ScanSource:
         else (base.shape[1] - 1 - base.central_ray[1], base.central_ray[0]),
         pixel_size_mm=sizes[0],
         row_pitch_mm=sizes[1],
-        shifts=lambda known: None if known is None else known[:, ::-1] * [1, -1],
+        table=lambda known: known if known.shifts is None else replace(known, shifts=known.shifts[:, ::-1] * [1, -1]),
     )
 
 
@@ -103,14 +104,14 @@ def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
     """
     words, own = [word.strip() for word in kinds.split(",")], dict[str, Any]()
     named = [word for word in words if not word.startswith(_ENERGY)]
-    keys = _stated_keys(",".join(named), int(base.image_key.size)) if named else base.image_key.copy()
+    keys = _stated_keys(",".join(named), len(base.table)) if named else base.table.kinds.copy()
     for word in words:
         if word.startswith(_ENERGY):
             own["energy_kev"], others = _of_one_energy(base, word)
             keys[others] = FrameKind.INVALID
     if base.quantity == "unknown" and base.dtype.kind in "ui" and {*keys.tolist()} >= {1, 2}:
         own["quantity"] = "counts"
-    return Frames(base, image_key=keys, **own)
+    return Frames(base, table=lambda known: replace(known, kinds=keys), **own)
 
 
 def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
@@ -132,15 +133,15 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
     Raises:
         DataError: no view is left.
     """
-    keys, n = base.image_key.copy(), int((base.image_key == FrameKind.PROJECTION).sum())
+    table, n, out = base.table, base.table.views.size, list[NDArray[np.int64]]()
     first, end, step = views.indices(n)
     if first >= end:
         raise DataError(f"--frames selects no view: {base.path} has {n}. They are counted from 0, without references.")
     for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION):
-        rows = np.flatnonzero(keys == kind)
+        rows = table.of_kind(kind)
         in_turn = slice(first % step, None, step) if rows.size % step == 0 else WHOLE
-        keys[np.delete(rows, views if kind is FrameKind.PROJECTION else in_turn)] = FrameKind.INVALID
-    return Frames(base, image_key=keys)
+        out.append(np.delete(rows, views if kind is FrameKind.PROJECTION else in_turn))
+    return Frames(base, table=lambda known: known.without(np.concatenate(out)))
 
 
 def _stated_keys(kinds: str, n: int) -> NDArray[np.int32]:
@@ -160,7 +161,7 @@ def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.boo
         kev = float(word.removeprefix(_ENERGY))
     except ValueError:
         raise DataError(f"--frames {word}: expected a number of keV, such as energy=20.") from None
-    known = source.energies
+    known = source.table.energies
     if known is None:
         raise DataError(f"--frames {word}: {source.path} states no energy of each frame. Leave it out.")
     others = np.abs(known - kev) > _SAME_ENERGY * kev
@@ -286,13 +287,14 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
 
 WRAPPED = "wrapped-numbers"  # a fact of a scan, and the rule on it
 _NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
+_NEARER = (10, 20, 40, 80, 160)  # parts of the range at the top, of which one holds what lies below 0, and no light
 _ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
 _SMOOTH = 3.0  # times the least change beside an edge: the step across the end, where one smooth image goes on there
 
 
-def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> tuple[int, bool]:
-    """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes; and whether
-    all is smooth where those at the top count as below 0, as of counts below a dark that was taken off them.
+def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> tuple[int, int]:
+    """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes; and the
+    count from which on all lies below 0, as counts below a dark that was taken off them; 0: it is light.
 
     Two pixels on either side lie in their half of the range, which one that is hot or was hit has not. Where nearly all
     at the top have one value, light was cut off there. 0 for fewer than one in ten rows has. Where a `flat` [..., col]
@@ -300,7 +302,7 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
     it.
     """
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
-        return 0, False
+        return 0, 0
     counts, whole = images.astype(np.int64) - np.iinfo(dtype).min, 2**16
     top, upper = counts >= whole - whole // _NEAR, counts >= whole // 2
     ends = np.where(top, 1, -1 * (counts < whole // _NEAR))
@@ -308,23 +310,34 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
     steps &= upper[..., 2:-1] == upper[..., 3:]
     change, above = np.abs(np.diff(counts)), upper[..., 1:-2]
     if flat is not None:
-        lit = flat - np.iinfo(dtype).min >= whole - whole // _NEAR
+        flat = flat - np.iinfo(dtype).min
+        lit = flat >= whole - whole // _NEAR
         beside = np.maximum(np.minimum(change[..., :-2], change[..., 2:]), 1)
         steps &= ~(lit[..., 1:-2] & lit[..., 2:-1]) | (whole - change[..., 1:-1] <= _SMOOTH * beside)
     edges = int(steps.sum())
     of_low, of_high = (np.where(side, change[..., 2:], change[..., :-2])[steps] for side in (above, ~above))
     most = np.unique(counts[top], return_counts=True)[1].max(initial=0)
     if edges < _A_ROW * np.prod(images.shape[:-1]) or most > 0.9 * top.sum():
-        return 0, False
+        return 0, 0
     if np.median(of_low) < _ALIKE * np.median(of_high):
-        return 0, False
-    steps_left = np.abs(np.diff(np.where(top, counts - whole, counts))) > whole // 2
-    return edges, bool(steps_left.sum() < _A_ROW * edges)
+        return 0, 0
+    at_top = np.maximum(counts[..., 1:-2], counts[..., 2:-1])[steps]
+    flats = np.zeros((1, 2)) if flat is None else flat
+    for least in (whole - whole // part for part in _NEARER):
+        odd = int((at_top < least).sum()) + _crossings(counts, least)
+        if odd < _A_ROW * edges and np.mean(flats >= least) < 0.5 and _crossings(flats, least) < _A_ROW * len(flats):
+            return edges, least + np.iinfo(dtype).min
+    return edges, 0
 
 
-def without_wraps(base: ScanSource, edges: int) -> ScanSource:
-    """A scan whose counts near the end of their range, which lay below a dark taken off them, are 0."""
-    least = 2**16 - 2**16 // _NEAR
+def _crossings(counts: NDArray[Any], least: int) -> int:
+    """Neighbours in a row on either side of `least` that differ by less than what is left of the range above it."""
+    over = counts >= least
+    return int(((over[..., 1:] != over[..., :-1]) & (np.abs(np.diff(counts)) < 2**16 - least)).sum())
+
+
+def without_wraps(base: ScanSource, edges: int, least: int) -> ScanSource:
+    """A scan whose counts from `least` on, which lay below a dark taken off them, are 0."""
     fact = (
         f"Numbers wrapped: {edges} pixels near 65535 lie beside ones near 0 in the frames looked at, as 16-bit "
         f"whole numbers do where the dark subtracted from them was larger. Those from {least} on are taken as 0. "
@@ -354,5 +367,7 @@ def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None 
                 f"{last.quantity} of {last.dtype} {last.shape}: they are no parts of one scan."
             )
     in_order = all(source.in_order for source in (*earlier, last))
-    own: dict[str, Any] = {} if path is None else {"path": path, "part_starts": np.zeros(1, np.int64)}
-    return Frames(*earlier, last, in_order=in_order, **own)
+    if path is None:
+        return Frames(*earlier, last, in_order=in_order)
+    one = np.zeros(1, np.int64)
+    return Frames(*earlier, last, in_order=in_order, path=path, table=lambda known: replace(known, part_starts=one))

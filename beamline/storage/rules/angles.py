@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding, Severity
-from drivers.base.frame import FrameKind
 from recon.base.units import look_like_degrees
 
 FARTHEST = 1e6  # degrees
@@ -23,8 +22,8 @@ _FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a tu
 
 def angles_known(source: ScanSource) -> Iterator[Finding]:
     """Every projection has a finite angle, in a sense that is certain."""
-    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
-    unknown = views[~np.isfinite(source.angles[views])]
+    views = source.table.views
+    unknown = views[~np.isfinite(source.table.angles[views])]
     if unknown.size:
         why = source.attributes.get("angles", "")
         yield Finding(
@@ -45,7 +44,7 @@ def angles_known(source: ScanSource) -> Iterator[Finding]:
 
 def angles_spread(source: ScanSource) -> Iterator[Finding]:
     """The projections have different directions, over half a turn, and their angles may be in degrees."""
-    angles = source.angles[source.image_key == FrameKind.PROJECTION]
+    angles = source.table.angles[source.table.views]
     if angles.size < 2 or not np.isfinite(angles).all():
         return
     farthest = float(np.abs(angles).max()) * 180 / np.pi
@@ -57,7 +56,7 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "angles are not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
         )
         return
-    degrees = np.degrees(angles)
+    degrees = np.asarray(np.degrees(angles), np.float64)
     span = float(np.ptp(degrees))
     distinct = np.unique(np.round(degrees, 6))
     if distinct.size == 1:

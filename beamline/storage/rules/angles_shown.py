@@ -114,16 +114,17 @@ class CoarseViews:
 
 def coarse_views(source: ScanSource) -> CoarseViews | None:
     """The coarse views of a scan, if it has enough views, and their line integrals are known."""
-    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
-    kinds = set(source.image_key.tolist())
+    views = source.table.placed_views
     counts = source.quantity == "counts"
-    if source.quantity == "unknown" or source.shifts is not None:
+    if source.quantity == "unknown" or source.table.shifts is not None:
         return None
-    if min(source.shape[1], views.size) < _LEAST_SEEN or (counts and not {FrameKind.DARK, FrameKind.FLAT} <= kinds):
+    if min(source.shape[1], views.size) < _LEAST_SEEN or (
+        counts and not source.table.has(FrameKind.DARK, FrameKind.FLAT)
+    ):
         return None
     light = ViewLight.of(source, reference_groups(source) if counts else None)
     views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
-    return CoarseViews(source, light, views, np.degrees(source.angles)) if views.size >= _LEAST_SEEN else None
+    return CoarseViews(source, light, views, np.degrees(source.table.angles)) if views.size >= _LEAST_SEEN else None
 
 
 def angles_shown(source: ScanSource) -> Iterator[Finding]:

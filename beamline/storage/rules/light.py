@@ -25,7 +25,6 @@ from beamline.storage.rules.references import (
     usual_exposure,
     views_differ,
 )
-from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, F64, I64
 from recon.base.noise import deviation_between_frames
 from recon.base.views import spread
@@ -51,7 +50,7 @@ MORE_LIGHT, HIGHER = 0.1, 0.01  # of flats and darks, shares of the light: examp
 
 def views_scaled(source: ScanSource) -> Iterator[Finding]:
     """Each view was rescaled on its own: all have the same least and largest number, at different pixels."""
-    rows = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    rows = source.table.views
     if rows.size < VIEWS:
         return
     ends, places = set(), (set[int](), set[int]())
@@ -142,7 +141,7 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
         return
     light = float(np.percentile((flat - dark)[lit], BRIGHT))
     limit = max(LIT * light, LIT_SIGMAS * place_noise(dark))
-    views = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    views = spread(source.table.views, VIEWS)
     under = [(dark - view)[lit] for view in cells_of(source, views)]
     deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
     if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
@@ -169,7 +168,7 @@ def _change(source: ScanSource, groups: ReferenceGroups) -> float:
 
 def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str:
     """Sentences on possible causes of a factor between views and flats."""
-    views = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    views = spread(source.table.views, VIEWS)
     flats = np.concatenate(groups.flats)
     seen, flat, dark = (mean_cells(source, rows) for rows in (views, flats, np.concatenate(groups.darks)))
     lit = lit_places(flat - dark)
@@ -185,7 +184,7 @@ def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str
 
 def _exposures_in_words(source: ScanSource, *rows: NDArray[np.int64]) -> str:
     """A sentence on the exposures that the file states of some flats and views."""
-    exposed = [source.exposures[some] for some in rows]
+    exposed = [source.table.exposures[some] for some in rows]
     if all(np.isfinite(each).all() for each in exposed):
         said = [f"{np.median(each):g} s" for each in exposed]
         return f"Stated exposures: flats {said[0]}, views {said[1]}."
@@ -198,7 +197,7 @@ def without_air(source: ScanSource, mean: float) -> str:
     A factor of the light is one constant in every line integral, and may be matter beyond the field as well. Of cans of
     1.5 to 3 times the field, the densities of FBP rise by 0.4 to 0.8 of the share, those of FISTA-TV by 0.9.
     """
-    flats, views = (np.flatnonzero(source.image_key == kind) for kind in (FrameKind.FLAT, FrameKind.PROJECTION))
+    flats, views = source.table.flats, source.table.views
     more = math.log1p(MORE_LIGHT)
     return (
         "No column shows air, so that nothing in the views tells whether flats and darks are right: flats with "
@@ -214,7 +213,7 @@ def _noise_ratio(source: ScanSource, groups: ReferenceGroups) -> float:
     Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
     the sample adds to the variance of views, so that their quietest places count.
     """
-    views = spread(np.flatnonzero(source.image_key == FrameKind.PROJECTION), VIEWS)
+    views = spread(source.table.views, VIEWS)
     taken = [np.concatenate(groups.darks), spread(max(groups.flats, key=len), VIEWS), views]
     darks, flats, seen = (read_known(source, some, _middle(source)).astype(np.float32) for some in taken)
     if len(flats) < LEAST_FLATS:
@@ -246,11 +245,11 @@ def exposures_agree(source: ScanSource) -> Iterator[Finding]:
     if source.quantity != "counts":
         return
     usual = usual_exposure(source)
-    darks, flats = (source.exposures[source.image_key == kind] for kind in (FrameKind.DARK, FrameKind.FLAT))
+    darks, flats = (source.table.exposures[rows] for rows in (source.table.darks, source.table.flats))
     if views_differ(source):
-        views = source.exposures[source.image_key == FrameKind.PROJECTION]
+        views = source.table.exposures[source.table.views]
         known = bool((flats > 0).all())
-        taken = exposures_of(source)[source.image_key == FrameKind.FLAT]
+        taken = exposures_of(source)[source.table.flats]
         doubt = f"taken for {usual:g} s" + (
             "."
             if known
@@ -279,7 +278,7 @@ _AS_GOOD = 0.8  # of the light of the best step, beside its flats: a sample take
 
 def light_one(source: ScanSource) -> Iterator[Finding]:
     """Views in a row have one light, but for a drift; else which step takes one, with its flats."""
-    flats, views = (np.flatnonzero(source.image_key == kind) for kind in (FrameKind.FLAT, FrameKind.PROJECTION))
+    flats, views = source.table.flats, source.table.views
     ends = views[:_IN_A_ROW], views[-_IN_A_ROW:]
     if (
         source.quantity != "counts"
@@ -290,7 +289,7 @@ def light_one(source: ScanSource) -> Iterator[Finding]:
         return
     levels = [_light_levels(source, part) for part in ends]
     n, change, most = lights_in_turn(levels[0]), np.ptp(levels[0]), ReferenceLimits().uneven
-    beside = np.median(np.abs(np.diff(source.angles[ends[0]]))) <= _BESIDE
+    beside = np.median(np.abs(np.diff(source.table.angles[ends[0]]))) <= _BESIDE
     if not (beside and n and n == lights_in_turn(levels[1]) and change >= most):
         return
     yield Finding(
@@ -312,7 +311,7 @@ def _way_of_steps(source: ScanSource, n: int, most: float) -> str:
 
 def _light_levels(source: ScanSource, rows: I64) -> F64:
     """Logarithms of the light of frames [frame]."""
-    darks = np.flatnonzero(source.image_key == FrameKind.DARK)
+    darks = source.table.darks
     dark = mean_cells(source, darks) if darks.size else 0.0
     light = [np.percentile(np.nan_to_num(cells) - dark, BRIGHT) for cells in cells_of(source, rows)]
     return np.asarray(np.log(np.maximum(light, 1e-30)), np.float64)
@@ -320,20 +319,17 @@ def _light_levels(source: ScanSource, rows: I64) -> F64:
 
 def _share_of_flats(source: ScanSource, step: slice, most: float) -> float:
     """Light of the views of a step over that of its flats; 0 where its flats differ, or are darker."""
-    keys = selected(source, step).image_key
-    flats, views = (
-        _light_levels(source, np.flatnonzero(keys == kind)[:_IN_A_ROW])
-        for kind in (FrameKind.FLAT, FrameKind.PROJECTION)
-    )
+    table = selected(source, step).table
+    flats, views = (_light_levels(source, rows[:_IN_A_ROW]) for rows in (table.flats, table.views))
     share = math.exp(np.median(views) - np.median(flats))
     return share if np.ptp(flats) < most and share <= 1 + DRIFT else 0.0
 
 
 def one_energy(source: ScanSource) -> Iterator[Finding]:
     """All views were taken at one energy, as a volume requires."""
-    if (energies := source.energies) is None:
+    if (energies := source.table.energies) is None:
         return
-    of_views = energies[source.image_key == FrameKind.PROJECTION]
+    of_views = energies[source.table.views]
     if len(parts := frames_by_energy(of_views)) > 1:
         yield Finding(
             "error",

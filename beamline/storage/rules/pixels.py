@@ -18,6 +18,7 @@ from recon.base.units import look_like_counts, look_like_light, look_like_transm
 from recon.base.views import spread
 
 CONSTANT_DARKS = "constant-darks"  # a rule whose finding is no fault, but which `info` shows
+_SURELY_BELOW, _FEW = 0.1, 0.005  # of the range below 0, and of the pixels: no noise of a signed number, nor spots
 _SAMPLES = 4  # frames of a kind that are looked at
 SHAPES = 32  # views whose shape is looked at
 _FALLS = (
@@ -48,16 +49,25 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
     samples = {kind: images for kind in kinds if (images := sample(source, kind)) is not None}
     frames, flats = samples.values(), samples.get(FrameKind.FLAT)
     flat = None if flats is None else np.median(flats, axis=0)
-    if edges := sum(wrapped_edges(images, source.dtype, flat)[0] for images in frames):
-        least, most = np.iinfo(source.dtype).min, np.iinfo(source.dtype).max
-        yield Finding(
-            "error",
-            WRAPPED,
-            f"Numbers wrapped: in {sum(map(len, frames))} frames looked at, {edges} pixels near {most} lie beside ones "
-            f"near {least}, as 16-bit whole numbers do that went beyond {most} and began again at {least}, "
-            "such as sums of pixels or frames. How bright these pixels were is lost, and other references do not help. "
-            "Make the frames again from those of the camera, as 32-bit or real numbers.",
-        )
+    signed = source.dtype.kind == "i" and source.quantity == "counts"
+    below = _SURELY_BELOW * np.iinfo(np.int16).min if signed else -np.inf
+    dark_too = FrameKind.DARK in samples and samples[FrameKind.DARK].min() < below
+    low = 0 if dark_too else sum(int((images < below).sum()) for images in frames)
+    edges = sum(wrapped_edges(images, source.dtype, flat)[0] for images in frames)
+    if not edges and low <= _FEW * sum(images.size for images in frames):
+        return
+    least, most = np.iinfo(source.dtype).min, np.iinfo(source.dtype).max
+    what = (
+        f"{edges} pixels near {most} lie beside ones near {least}" if edges else f"{low} pixels are below {below:.0f}"
+    )
+    yield Finding(
+        "error",
+        WRAPPED,
+        f"Numbers wrapped: in {sum(map(len, frames))} frames looked at, {what}, as 16-bit whole numbers do that went "
+        f"beyond {most} and began again at {least}, such as sums of pixels or frames. How bright these pixels were is "
+        "lost, and other references do not help. Make the frames again from those of the camera, as 32-bit or real "
+        "numbers.",
+    )
 
 
 def quantity_stated(source: ScanSource) -> Iterator[Finding]:
@@ -144,7 +154,7 @@ def _rises(source: ScanSource) -> bool:
 
 def sample(source: ScanSource, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:
     """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None where there is none."""
-    rows = np.flatnonzero(source.image_key == kind)
+    rows = source.table.of_kind(kind)
     if rows.size == 0:
         return None
     rows = spread(rows, count)

@@ -44,9 +44,9 @@ class ReferenceGroups:
 
 def groups_of(source: ScanSource, kind: FrameKind) -> tuple[I64, ...]:
     """Rows of the references of a kind, by groups: references of one part with no projection between them."""
-    rows = np.flatnonzero(source.image_key == kind)
-    before = np.cumsum(source.image_key == FrameKind.PROJECTION)[rows]
-    before += np.searchsorted(source.part_starts, rows, "right")  # neither decreases, so that the sum tells both
+    rows = source.table.of_kind(kind)
+    before = np.searchsorted(source.table.views, rows)
+    before += np.searchsorted(source.table.part_starts, rows, "right")  # neither decreases, so that the sum tells both
     return tuple(np.split(rows, np.flatnonzero(np.diff(before)) + 1)) if rows.size else ()
 
 
@@ -79,23 +79,23 @@ def reference_groups(source: ScanSource, limits: ReferenceLimits | None = None) 
 
 
 def _depends_on(source: ScanSource, limits: ReferenceLimits | None) -> tuple[object, ...]:
-    rows = (source.image_key, source.exposures, source.angles, source.part_starts)
+    rows = (source.table.kinds, source.table.exposures, source.table.angles, source.table.part_starts)
     return limits, *(values.tobytes() for values in rows), tuple(source.unreadable)
 
 
 def _findings(source: ScanSource, taken: ReferenceGroups, limits: ReferenceLimits | None) -> tuple[Finding, ...]:
     """Findings on references, flats beside those and the views of their part; errors where none of a kind is good."""
     darks, found = tuple(_readable(source, group) for group in taken.darks), dict[Finding, None]()
-    for start, end in pairwise([*source.part_starts.tolist(), source.image_key.size]):
+    for start, end in pairwise([*source.table.part_starts.tolist(), len(source.table)]):
         flats = [group for group in taken.flats if start <= group[0] < end]
         seen = tuple(_readable(source, group) for group in flats)
-        views = start + np.flatnonzero(source.image_key[start:end] == FrameKind.PROJECTION)
+        views = source.table.views_of(start, end)
         if flats or not taken.flats:
             found |= dict.fromkeys(judge(Evidence((*darks, *seen), _views_beside(source, views, flats)), limits))
     rows = {row for finding in found for row in finding.frames}
-    good = {int(source.image_key[row]) for group in (*taken.darks, *taken.flats) for row in group if row not in rows}
+    good = {source.table.kind(row) for group in (*taken.darks, *taken.flats) for row in group if row not in rows}
     return tuple(
-        replace(each, severity="warning") if each.frames and int(source.image_key[each.frames[0]]) in good else each
+        replace(each, severity="warning") if each.frames and source.table.kind(each.frames[0]) in good else each
         for each in found
     )
 
@@ -126,7 +126,7 @@ def references_usable(source: ScanSource, accepted: bool = False) -> Iterator[Fi
     for finding in reference_groups(source).findings if source.quantity == "counts" else ():
         message = finding.message
         if finding.frames:
-            name = f"{FrameKind(int(source.image_key[finding.frames[0]])).name.lower()}s"
+            name = f"{source.table.kind(finding.frames[0]).name.lower()}s"
             if accepted:
                 message = f"--references accept: {message}"
             elif finding.severity == "error":
@@ -149,7 +149,7 @@ def seen_frame(source: ScanSource, row: int) -> FrameStatistics:
 
     They are those with the dark of the shortest exposure and, of projections that differ, at the usual exposure.
     """
-    frame, groups = _as_it_is(source, row), by_exposure(source, np.flatnonzero(source.image_key == FrameKind.DARK))
+    frame, groups = _as_it_is(source, row), by_exposure(source, source.table.darks)
     differ = views_differ(source) and groups[0][1].size > 0
     if not frame.exposure > 0 or not (len(groups) > 1 or differ):
         return frame
@@ -167,10 +167,10 @@ def _as_it_is(source: ScanSource, row: int) -> FrameStatistics:
     seen = _seen.setdefault(source, {})
     if row not in seen:
         image = read_known(source, [row])[0]
-        counted = source.quantity == "counts" and source.image_key[row] != FrameKind.DARK
+        counted = source.quantity == "counts" and source.table.kind(row) is not FrameKind.DARK
         seen[row] = look_at(with_borders_filled(image) if counted else image, row)
-    kind = FrameKind(int(source.image_key[row]))
-    return replace(seen[row], kind=kind, exposure=float(source.exposures[row]))
+    kind = source.table.kind(row)
+    return replace(seen[row], kind=kind, exposure=float(source.table.exposures[row]))
 
 
 def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
@@ -206,24 +206,25 @@ def cells_of(source: ScanSource, rows: I64) -> list[F32]:
 
 def usual_exposure(source: ScanSource) -> float:
     """The median exposure of the projections in s; NaN if it is unknown."""
-    known = source.exposures[(source.image_key == FrameKind.PROJECTION) & (source.exposures > 0)]
+    of_views = source.table.exposures[source.table.views]
+    known = of_views[of_views > 0]
     return float(np.median(known)) if known.size else np.nan
 
 
 def views_differ(source: ScanSource) -> bool:
     """Whether the exposures of the projections differ, and that of each is known."""
-    views = source.exposures[source.image_key == FrameKind.PROJECTION]
+    views = source.table.exposures[source.table.views]
     return bool(views.size and (views > 0).all() and np.ptp(views) > EXPOSURE_TOLERANCE * np.median(views))
 
 
 def by_exposure(source: ScanSource, rows: I64) -> list[tuple[float, I64]]:
     """The rows of each exposure among these frames; one group, of NaN, if one is unknown or all have one."""
-    seconds = source.exposures[rows]
+    seconds = source.table.exposures[rows]
     if not rows.size or not (seconds > 0).all() or np.ptp(seconds) <= EXPOSURE_TOLERANCE * seconds.min():
         return [(np.nan, rows)]
     order = np.argsort(seconds, kind="stable")
     edges = np.flatnonzero(np.diff(seconds[order]) > EXPOSURE_TOLERANCE * seconds[order][:-1]) + 1
-    return [(float(np.median(source.exposures[part])), np.sort(part)) for part in np.split(rows[order], edges)]
+    return [(float(np.median(source.table.exposures[part])), np.sort(part)) for part in np.split(rows[order], edges)]
 
 
 def exposures_of(source: ScanSource) -> F64:
@@ -232,21 +233,20 @@ def exposures_of(source: ScanSource) -> F64:
     Of flats that state none beside views that differ: the longest, the median or the shortest of the views', the first
     for which no place of the views is brighter than the flats.
     """
-    flats = np.flatnonzero((source.image_key == FrameKind.FLAT) & ~(source.exposures > 0))
-    darks = np.flatnonzero(source.image_key == FrameKind.DARK)
-    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+    table, exposures = source.table, source.table.exposures
+    flats, darks, views = table.flats[~(exposures[table.flats] > 0)], table.darks, table.views
     if not (flats.size and darks.size and views_differ(source)):
-        return source.exposures
+        return exposures
     dark, light = (mean_cells(source, rows) for rows in (darks, flats))
     lit = lit_places(light - dark)
     seen = [mean_cells(source, row) for row in spread(views, VIEWS)[:, None]]
     shares = [np.percentile((cells - dark)[lit] / (light - dark)[lit], WORST) for cells in seen if lit.any()]
     most = usual_exposure(source) / max(float(np.median(shares)), 1e-30) if shares else 0.0
-    of_views = source.exposures[views]
+    of_views = exposures[views]
     for each in (of_views.max(), np.median(of_views), of_views.min()):
         if each <= (1 + DRIFT) * most:
-            return np.where(np.isin(np.arange(source.image_key.size), flats), each, source.exposures)
-    return source.exposures
+            return np.where(np.isin(np.arange(len(table)), flats), each, exposures)
+    return exposures
 
 
 LEAST = 0.01  # share of the light of the brightest views, in a view's own bright part: all matter leaves that much open
@@ -274,7 +274,7 @@ class ViewLight:
     @classmethod
     def of(cls, source: ScanSource, used: ReferenceGroups | None) -> ViewLight:
         """The light from these darks and flats, and some views; None if the scan has line integrals."""
-        views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
+        views = source.table.views
         if used is None:
             return cls(source, None, None, 1.0)
         dark, flat = (mean_cells(source, np.concatenate(groups)) for groups in (used.darks, used.flats))

@@ -6,20 +6,23 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
+
 from beamline.core.files import run_of
 from beamline.core.text import count, spans
 from beamline.plan.passes import ended_by
 from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules import Finding
+from beamline.storage.rules import Finding, Severity
 from beamline.storage.rules.angles import angles_known, angles_spread
 from beamline.storage.rules.angles_shown import angles_shown
 from beamline.storage.rules.light import exposures_agree, light_one, one_energy, views_scaled
 from beamline.storage.rules.pixels import darks_measured, numbers_wrapped, pixels_measured, quantity_stated
-from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelled, views_first
+from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelled, sinogram_said, views_first
 from drivers.base.frame import FrameKind
 
+VARYING = "lengths"  # a rule on those that differ from view to view
 _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
 
 
@@ -30,11 +33,11 @@ def scan_findings(source: ScanSource) -> list[Finding]:
 
 def scan_ended(source: ScanSource) -> Iterator[Finding]:
     """The writer closed the file, and the scan ended as planned; else a remedy, or who ended it."""
-    ending, n = source.ending, count(source.image_key.size, "frame")
+    ending, n = source.ending, count(len(source.table), "frame")
     if not source.finished:
         sentence = f"The file was not closed: {n} can be trusted."
     elif ending.status in ("stopped", "failed"):
-        planned, taken = source.plan.get("angles_deg", ()), int((source.image_key == FrameKind.PROJECTION).sum())
+        planned, taken = source.plan.get("angles_deg", ()), source.table.views.size
         of_plan = f", with {taken} of {len(planned)} views" if isinstance(planned, list) and planned else ""
         of_plan += "; it had decided against the others" if ended_by(source.decisions) else ""
         sentence = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
@@ -47,7 +50,7 @@ def scan_ended(source: ScanSource) -> Iterator[Finding]:
 
 def altered_sentence(source: ScanSource) -> str:
     """Sentences on the rows of a scan whose record differs from its checksum."""
-    rows = sorted(source.altered)
+    rows = np.flatnonzero(source.table.altered).tolist()
     return (
         f"{source.path}: what is said of {count(len(rows), 'frame')} (kind, angle, time, trigger) differs from the "
         f"checksum written with it: {spans(rows)}. Nothing uses {'it' if len(rows) == 1 else 'them'}. Look for a good "
@@ -57,21 +60,23 @@ def altered_sentence(source: ScanSource) -> str:
 
 def enough_views(source: ScanSource) -> Iterator[Finding]:
     """A reconstruction needs at least two projections."""
-    n = int((source.image_key == FrameKind.PROJECTION).sum())
+    n = source.table.views.size
     if n < 2:
         yield Finding("error", "views", f"{n} projections: a reconstruction needs at least 2, a good one hundreds.")
 
 
 def references_present(source: ScanSource) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
-    if source.quantity != "counts":
-        return
     path = Path(source.path).absolute()
     others = [each.name for each in path.parent.glob("*/") if each != path] if path.is_dir() else []
     beside = ", ".join(sorted(name for name in others if re.search("dark|flat|white|open.?beam", name.lower()))[:4])
     way = f" Beside it lie {beside}: {path.parent} is read with all of them." if beside else ""
+    if source.quantity != "counts":
+        if source.quantity == "unknown" and way:
+            yield Finding("error", "references", f"Darks and flats may be elsewhere.{way}")
+        return
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
-        if not (source.image_key == kind).any():
+        if not source.table.of_kind(kind).size:
             yield Finding(
                 "error",
                 "references",
@@ -102,14 +107,15 @@ def stated_used(source: ScanSource) -> Iterator[Finding]:
     """Everything that the file states is used or reported: as a warning if it may change the volume."""
     for field in source.not_used:
         message = f"The file states {field.where}, {field.value}, which is not used: {field.why}."
-        yield Finding("warning" if field.doubt else "info", "not-used", message)
+        severity: Severity = "error" if field.wrong else "warning" if field.doubt else "info"
+        yield Finding(severity, VARYING if field.wrong else "not-used", message)
 
 
-def central_ray_taken(source: ScanSource, cone: tuple[float, float] | None = None) -> Iterator[Finding]:
+def central_ray_taken(source: ScanSource) -> Iterator[Finding]:
     """The central ray of a cone, which the file states or the caller, meets the middle of the rows, and the axis."""
     ways = ("row", "the middle of the rows", "--central-row"), ("column", "the rotation axis", "--axis")
     for (side, taken, option), at, n in zip(ways, source.central_ray or (), source.shape, strict=False):
-        if (cone or source.cone) is not None and abs(at - (n - 1) / 2) > _OFF_MIDDLE * n:
+        if source.cone is not None and abs(at - (n - 1) / 2) > _OFF_MIDDLE * n:
             yield Finding(
                 "warning",
                 f"central-{side}",
@@ -145,7 +151,7 @@ def pixels_square(source: ScanSource) -> Iterator[Finding]:
 
 def parts_joined(source: ScanSource) -> Iterator[Finding]:
     """The file is not a single part of a resumed scan."""
-    if source.part_starts.size > 1:
+    if source.table.part_starts.size > 1:
         return
     if (joined_file := joined_file_of(source.path)) is not None and is_joined(joined_file[0]):
         joined, n = joined_file
@@ -175,6 +181,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     views_scaled,
     axis_vertical,
     views_first,
+    sinogram_said,
     series_complete,
     scale_known,
     pixels_square,

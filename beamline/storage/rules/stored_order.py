@@ -46,8 +46,8 @@ def _roughness(views: NDArray[Any]) -> float:
 
 def axis_vertical(source: ScanSource) -> Iterator[Finding]:
     """The rotation axis is parallel to the columns: each detector row then shows the same matter in every view."""
-    views = np.flatnonzero((source.image_key == FrameKind.PROJECTION) & np.isfinite(source.angles))
-    if source.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
+    views = source.table.placed_views
+    if source.table.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
         return
     depths = _depths(source, spread(views, _TURNED))
     if not depths.size:
@@ -105,9 +105,9 @@ def views_first(source: ScanSource) -> Iterator[Finding]:
     In sinograms it is the other way round: of each image the rows are views, so that they have one mass, and the first
     moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do not.
     """
-    views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)
-    angles = source.angles[views]
-    if source.shifts is not None or not views.size == source.shape[0] >= _LEAST_SQUARE:
+    views = source.table.views
+    angles = source.table.angles[views]
+    if source.table.shifts is not None or not views.size == source.shape[0] >= _LEAST_SQUARE:
         return
     some = np.arange(views.size)[:: -(-views.size // SHAPES)]
     depths = _depths(source, views[some]) if np.isfinite(angles).all() and source.shape[1] >= _LEAST else np.zeros(0)
@@ -132,6 +132,26 @@ def views_first(source: ScanSource) -> Iterator[Finding]:
         )
 
 
+SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and `recon` show
+
+
+def sinogram_said(source: ScanSource) -> Iterator[Finding]:
+    """One array [view, col] has no rows: what is taken for its views, and how another order is said."""
+    axes = str(source.attributes.get("dimensions", "")).split(",")
+    if sorted(axes) == ["col", "frame"]:
+        n = source.table.views.size
+        first = axes[0] == "frame"
+        option = "--order col,view" if first else "--order view,col"
+        if source.format == "data_exchange":
+            option = f"the attribute axes of /exchange/data ({'x:theta' if first else 'theta:x'})"
+        yield Finding(
+            "info",
+            SINOGRAM,
+            f"The array has two dimensions: it is taken as one sinogram of {n} views and {source.shape[1]} columns. "
+            f"Where these are exchanged, {option} says so.",
+        )
+
+
 def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> float:
     """Share of the change of values [view, of each] that is a sine of the angles [view]."""
     parts = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
@@ -144,7 +164,7 @@ def _depths(source: ScanSource, views: NDArray[np.int64]) -> NDArray[np.float64]
     """Line integrals of some views [view, row, col], coarse, but for what all views share."""
     block = max(1, min(max(source.shape) // 128, min(source.shape) // _LEAST))
     rows, cols = (n // block for n in source.shape)
-    darks = np.flatnonzero(source.image_key == FrameKind.DARK)[:1]
+    darks = source.table.darks[:1]
     dark = read_known(source, darks)[0].astype(np.float64) if darks.size and source.quantity == "counts" else 0.0
     bits = []
     for view in views.tolist():

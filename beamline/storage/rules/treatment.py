@@ -14,9 +14,8 @@ from beamline.monitor.check import Level
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
-from beamline.storage.readers.base import ScanSource, rows_replaced
+from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
-from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 
 LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
@@ -121,10 +120,10 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
     Args:
         judged: flags that count in place of the file's.
     """
-    flags = source.flags if judged is None else judged
+    flags = source.table.flags if judged is None else judged
     if flags is None or not flags.flagged.any():
         return
-    rows, again = np.flatnonzero(flags.alarmed), rows_replaced(source)
+    rows, again = np.flatnonzero(flags.alarmed), source.table.replaced
     message = f"The monitor flagged {flags.flagged.sum()} of {flags.bits.size} frames: {counted(flags.counts())}."
     if not rows.size:
         yield Finding("info", "flags", message)
@@ -140,7 +139,7 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
             yield Finding("info", "flags", f"{message} No other frame has an alarm.")
             return
         message += f" Frames with an alarm beside these: {spans(rows.tolist())}."
-    treated = treatment_of(flags, source.image_key == FrameKind.PROJECTION, source.shape)
+    treated = treatment_of(flags, source.table.are_views, source.shape)
     n, lost = int(treated.views.sum()), int(treated.left_out.sum())
     if lost and n - lost < FEWEST_VIEWS:
         message += (

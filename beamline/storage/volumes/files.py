@@ -17,7 +17,8 @@ from beamline.core.events import json_of
 from beamline.core.files import bring_to_disk, whole_file
 from beamline.core.quantities import VoxelKind
 from beamline.storage import datasets, hdf5
-from beamline.storage.foreign_zarr import is_zarr, open_zarr
+from beamline.storage.array_file import is_zarr
+from beamline.storage.foreign_zarr import open_zarr
 from beamline.storage.readers.base import Opening
 from beamline.storage.readers.open import FORMATS as SCANS
 from beamline.storage.readers.tiff import VOLUME

@@ -32,7 +32,6 @@ from beamline.storage.writers import layout
 from beamline.storage.writers.layout import ScanInfo
 from beamline.storage.writers.rows import (
     STATUSES,
-    Record,
     Rows,
     ScanEnding,
     put_exchange_view,
@@ -145,13 +144,9 @@ class NXtomoWriter:
         frame; the frames before stay readable, and nothing more can be appended.
         """
         self._check(frame, digest)
-        record = Record(
-            frame.kind, frame.angle, frame.exposure, frame.trigger, frame.framestamp, frame.time,
-            mark_of(flag for flag in flags if flag.frame == frame.index), frame.replaces, frame.aside,
-        )  # fmt: skip
         try:
             self._require_untouched()
-            self._table.write(self._rows, frame.counts, digest, record)
+            self._table.write(frame, digest, mark_of(flag for flag in flags if flag.frame == frame.index))
             for flag in flags:
                 if flag.frames != range(frame.index, frame.index + 1) and (bits := bitmask([flag])):
                     self._table.add_flags(flag.frames, bits)

@@ -1,4 +1,4 @@
-"""Rows of a scan file, one a frame, whether each is still as it was written; and the end of the file.
+"""Rows of a scan file, one a frame, and the end of the file.
 
 It tells how the scan ended, which triggers gave no frame and why, and has the frames as /exchange, the layout of De
 Carlo et al. (2014), "Scientific data exchange: a schema for HDF5-based storage of raw and analyzed data",
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import shutil
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,82 +25,13 @@ from beamline.monitor.checks import ALARMS
 from beamline.monitor.digest import FrameDigest
 from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark
+from beamline.storage.recorded_frames import frames_in, image_key_of, record_checksums
 from beamline.storage.writers import layout
-from drivers.base.frame import FrameKind
+from drivers.base.frame import Frame, FrameKind
+from recon.base.arrays import I64
 
 ROOM = 2**24  # bytes on the disk, far more than the /exchange view takes
 PER_FLUSH = 64  # rows that are written before a flush where nobody reads yet
-
-_RECORD = np.dtype([(path, layout.COLUMNS[path][0]) for path in layout.RECORDED])
-"""56 bytes, little-endian, without gaps."""
-
-
-@dataclass(frozen=True)
-class Record:
-    """Metadata of a frame in its row; units as in drivers.base.frame.Frame (radians, s)."""
-
-    kind: FrameKind
-    angle: float
-    exposure: float = np.nan
-    trigger: int = -1
-    framestamp: int = -1
-    time: float = np.nan
-    mark: Mark = UNMARKED
-    replaces: int = -1
-    aside: float = 0.0
-
-
-def image_key_of(kind: FrameKind) -> int:
-    """NXtomo's image key of a kind of frame. NXtomo has no key for alignment frames: programs that do not know them
-    must not use them. A wide view is a projection, of a translated sample.
-    """
-    return int({FrameKind.ALIGNMENT: FrameKind.INVALID, FrameKind.WIDE_VIEW: FrameKind.PROJECTION}.get(kind, kind))
-
-
-def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
-    """CRC-32 [row] of the `layout.RECORDED` columns [row], by their paths.
-
-    The row of a repeated frame becomes an invalid one, but its checksum is still that of its first kind.
-    """
-    table = np.empty(len(columns[layout.KIND]), _RECORD)
-    for path in layout.RECORDED:
-        table[path] = columns[path]
-    rows, size = table.tobytes(), _RECORD.itemsize
-    return np.array([zlib.crc32(rows[i : i + size]) for i in range(0, len(rows), size)], np.uint32)
-
-
-def altered_rows(file: h5py.File, first: int, end: int) -> NDArray[np.intp]:
-    """Rows whose record differs from its checksum, from the row `first` on.
-
-    Raises:
-        ValueError: a column is not as `create` made it.
-    """
-    columns = {}
-    for path in (*layout.RECORDED, layout.RECORD_CHECKSUM):
-        column = file[path]
-        if len(column) < end:  # a reader has some of them open already, see look_again
-            hdf5.look_again(column)
-        columns[path] = column[first:end]
-        if columns[path].shape != (end - first,) or column.dtype != layout.COLUMNS[path][0]:
-            raise ValueError(
-                f"{path} is {column.dtype} {column.shape}, expected {layout.COLUMNS[path][0]} of {end} rows"
-            )
-    checksums = columns[layout.RECORD_CHECKSUM]
-    good = np.asarray(record_checksums(columns) == checksums)
-    marked = ~good & ((columns[layout.KIND] == FrameKind.INVALID) | (columns[layout.IMAGE_KEY] == FrameKind.INVALID))
-    for kind in FrameKind if marked.any() else ():  # as of a repeated frame, whose checksum is that of its kind
-        codes = {layout.IMAGE_KEY: image_key_of(kind), layout.KIND: int(kind)}
-        before = {path: np.full_like(columns[path], code) for path, code in codes.items()}
-        good[marked] |= (record_checksums({**columns, **before}) == checksums)[marked]
-    return np.flatnonzero(~good)
-
-
-def require_earlier(replaces: NDArray[np.integer[Any]]) -> None:
-    """Raise ValueError if a row claims to replace itself or a later one. replaces: [row]; -1: none."""
-    wrong = np.flatnonzero(replaces >= np.arange(replaces.size))
-    if wrong.size:
-        row = int(wrong[0])
-        raise ValueError(f"row {row} claims to replace row {replaces[row]}; only an earlier row can be replaced")
 
 
 class Rows:
@@ -117,38 +47,39 @@ class Rows:
         self._types = {path: column.dtype for path, column in self._columns.items()}
         self._first, self._said = 0, list[dict[str, Any]]()
 
-    def write(self, row: int, image: NDArray[Any], digest: FrameDigest, record: Record) -> None:
-        """Write row `row`, an existing one or the next: pixels at once, metadata at the next `flush`.
+    def write(self, frame: Frame, digest: FrameDigest, mark: Mark = UNMARKED) -> None:
+        """Write the row `frame.index`, an existing one or the next: pixels at once, metadata at the next `flush`.
 
         A view that it replaces becomes an invalid frame, so that no program takes both.
         """
+        row = frame.index
         if row != self._first + len(self._said):
             self.flush()
             self._first = row
         values = {
-            layout.IMAGE_KEY: image_key_of(record.kind),
-            layout.KIND: max(int(record.kind), int(FrameKind.ALIGNMENT)),
-            layout.X_TRANSLATION: record.aside,
-            layout.COUNT_TIME: record.exposure,
-            layout.ANGLE: math.degrees(record.angle),
-            layout.TRIGGER: record.trigger,
-            layout.FRAMESTAMP: record.framestamp,
-            layout.TIME: record.time,
-            layout.REPLACES: record.replaces,
-            FLAGS: record.mark.bits,
-            VALID: record.mark.valid,
-            SCORES: record.mark.scores,
-            REGIONS: record.mark.regions,
+            layout.IMAGE_KEY: image_key_of(frame.kind),
+            layout.KIND: max(int(frame.kind), int(FrameKind.ALIGNMENT)),
+            layout.X_TRANSLATION: frame.aside,
+            layout.COUNT_TIME: frame.exposure,
+            layout.ANGLE: math.degrees(frame.angle),
+            layout.TRIGGER: frame.trigger,
+            layout.FRAMESTAMP: frame.framestamp,
+            layout.TIME: frame.time,
+            layout.REPLACES: frame.replaces,
+            FLAGS: mark.bits,
+            VALID: mark.valid,
+            SCORES: mark.scores,
+            REGIONS: mark.regions,
             layout.RECORD_CHECKSUM: 0,  # worked out where the rows are written
         } | {f"/entry/digest/{name}": value for name, value in vars(digest).items()}
-        for dataset, pixels in ((self._data, image), (self._preview, digest.preview)):
+        for dataset, pixels in ((self._data, frame.counts), (self._preview, digest.preview)):
             self._grow(dataset, row + 1)
             dataset.id.write_direct_chunk((row, 0, 0), np.ascontiguousarray(pixels, dataset.dtype))
         self._said.append({path: values[path] for path in self._columns})
-        if record.replaces >= 0:
+        if frame.replaces >= 0:
             self.flush()
             for path in (layout.IMAGE_KEY, layout.KIND):
-                self._columns[path][record.replaces] = int(FrameKind.INVALID)
+                self._columns[path][frame.replaces] = int(FrameKind.INVALID)
 
     def flush(self) -> None:
         """Write the metadata of the rows since the last call. The caller then flushes the file."""
@@ -232,10 +163,10 @@ def put_exchange_view(path: Path) -> None:
         raise DataError(f"{path} does not take the view ({hdf5.reason(error)}).") from error
 
 
-def _rows(file: h5py.File) -> dict[str, NDArray[np.intp]]:
+def _rows(file: h5py.File) -> dict[str, I64]:
     """Rows of each dataset of the view."""
-    kinds = file[layout.KIND][: int(file[layout.COMMITTED][()])]
-    rows = {name: np.flatnonzero(kinds == kind) for kind, name in NAMES.items()}
+    table = frames_in(file)
+    rows = {name: table.of_kind(kind) for kind, name in NAMES.items()}
     return {name: rows_of_kind for name, rows_of_kind in rows.items() if rows_of_kind.size}
 
 

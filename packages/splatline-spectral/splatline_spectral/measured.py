@@ -122,8 +122,8 @@ def _of_scans(scans: Sequence[Path]) -> tuple[Reals, tuple[int, int], Read]:
             dark = _mean(source, FrameKind.DARK, part)
             flat = _mean(source, FrameKind.FLAT, part) - dark
             views = _some(source, FrameKind.PROJECTION)
-            flats = source.exposures[source.image_key == FrameKind.FLAT]
-            scale = np.nanmean(source.exposures[views]) / np.nanmean(flats)
+            flats = source.table.exposures[source.table.flats]
+            scale = np.nanmean(source.table.exposures[views]) / np.nanmean(flats)
             flat = flat * (scale if np.isfinite(scale) else 1.0)
             total = sum(line_integrals(_frame(source, view, part) - dark, flat) for view in views)
         return np.asarray(total / views.size, np.float64)
@@ -132,7 +132,7 @@ def _of_scans(scans: Sequence[Path]) -> tuple[Reals, tuple[int, int], Read]:
 
 
 def _some(source: ScanSource, kind: FrameKind) -> NDArray[np.int64]:
-    frames = np.flatnonzero(source.image_key == kind)
+    frames = source.table.of_kind(kind)
     if not frames.size:
         raise DataError(f"{source.path} has no {kind.name.lower()}s. Nothing was written.")
     return frames[np.unique(np.linspace(0, frames.size - 1, _MOST_VIEWS).round().astype(int))]

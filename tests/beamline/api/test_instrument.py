@@ -85,7 +85,7 @@ def test_ctrl_c_ends_the_loop_and_keeps_the_data(connected: Connected, closed: l
     assert signal.getsignal(signal.SIGINT) is before
     assert instrument.last is not None and instrument.last.status == "stopped"
     with open_scan(instrument.last.path) as source:
-        assert source.finished and len(source.image_key) == instrument.last.frames < FRAMES
+        assert source.finished and len(source.table.kinds) == instrument.last.frames < FRAMES
 
 
 def test_a_second_ctrl_c_aborts(connected: Connected) -> None:

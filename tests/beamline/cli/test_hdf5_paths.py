@@ -54,5 +54,5 @@ def test_info_validate_monitor_and_ingest(foreign: Path) -> None:
     succeeds("ingest", "f.h5", "in.h5", *LAYOUT, "--pixel-size-um", "500")
     with open_scan(Path("in.h5")) as ours:
         assert ours.quantity == "counts"
-        np.testing.assert_array_equal(ours.angles[4:], np.radians(np.degrees(SCAN.angles)))
+        np.testing.assert_array_equal(ours.table.angles[4:], np.radians(np.degrees(SCAN.angles)))
         assert ours.read([0, 2]).mean(axis=(1, 2)).tolist() == [DARK, DARK + BEAM]

@@ -30,7 +30,7 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     sweep, worker = pytest.importorskip(SWEEP), pytest.importorskip("beamline.features.trials.worker")
     source = ArraySource(SCAN.line_integrals().astype(np.float32), [0] * len(SCAN.angles), SCAN.angles)
     source.quantity = "line_integrals"
-    prepared = prepare_projections(source, Selection(views="every:3", axis_col=20.7), lambda _: None)  # type: ignore[arg-type]
+    prepared = prepare_projections(source, Selection(views="every:3", axis_col=20.7), lambda _: None)
     prepared = replace(prepared, view_weights=None)
     grid = Grid.matching(prepared.geometry)
     volume = Volume(direct(prepared.projections.data, prepared.geometry, grid, "hann"), grid)

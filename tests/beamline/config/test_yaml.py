@@ -51,7 +51,8 @@ def test_overrides_scenes_and_recipes_are_read_alike(tmp_path: Path) -> None:
     assert "more than settings hold" in beamline("recon", "scan.h5", "--config", path).stderr
 
 
-def test_aliases_and_long_texts_of_a_person_are_read() -> None:
+def test_dates_aliases_and_long_texts_of_a_person_are_read() -> None:
+    assert read("name: 2024-02-30\n", "my.yaml").data["name"] == "2024-02-30"
     text = f"beam: &beam {{energy: 25}}\nother: {{<<: *beam, name: '{5000 * 'x'}'}}\ntime: 1:30\n"
     assert read(text, "my.yaml").data["other"]["energy"] == 25 and read(text, "my.yaml").data["time"] == 90
 
@@ -73,6 +74,11 @@ FAULTS = {
     "between": ("scan:\n    mode: step\n  views: 3\n", 3, "the indentation of this line is that of no group above"),
     "at": ("sample:\n  name: @x\n", 2, "a value begins with '@'; put it into quotes"),
     "star": ("sample:\n  name: *x\n", 2, "text that begins with * or & needs quotes"),
+    "control character": ("a: 1\nb: x\0y\n", 2, "the character U+0000 belongs to no text"),
+    "tag": ("a: 1\nb: !foo 3\n", 2, "text that begins with ! or = needs quotes"),
+    "equals": ("a: 1\nb: =\n", 2, "text that begins with ! or = needs quotes"),
+    "two documents": ("a: 1\n---\nb: 2\n", 2, "a second document begins here"),
+    "list as a key": ("? [1, 2]\n: 3\n", 1, "a key of this line is a list or a group"),
     "backslash": ('a: 1\nb: "C:\\data"\n', 2, "in double quotes, a backslash begins a special character"),
 }
 

@@ -46,7 +46,7 @@ def _labels(folder: Path) -> dict[str, tuple[int, int]]:
 def test_labels_of_injected_anomalies_lie_beside_the_file(tmp_path: Path) -> None:
     result = run_scan(_config(BALL | {"effects": [GHOST, BAND]}), tmp_path)
     with open_scan(result.path) as source:
-        kinds, frames = source.image_key, source.read(slice(None)).astype(float)
+        kinds, frames = source.table.kinds, source.read(slice(None)).astype(float)
     light = np.flatnonzero(kinds != FrameKind.DARK)
     runs = read_labels(result.path.with_name("scan.labels.json"))
     bands = [run for run in runs if run.kind == "black_band"]
@@ -76,7 +76,7 @@ def test_no_anomaly_is_said_too_and_a_stopped_scan_has_labels_of_its_frames(
         run_scan(_config(BALL | {"effects": [BAND]}), tmp_path / "some", stop=stop)
     (folder,) = (tmp_path / "some").iterdir()
     with open_scan(folder / "scan.h5") as source:
-        last = int(np.flatnonzero(source.image_key != FrameKind.DARK).max())
+        last = int(np.flatnonzero(source.table.kinds != FrameKind.DARK).max())
         assert last < 15
     assert _labels(folder) == {"black_band": (2, last)}
 

@@ -53,7 +53,7 @@ def scan(balls: Balls, in_flats: NDArray[np.float64], drift: float = 0.0, seed: 
 
 
 def told(source: ArraySource) -> list[Finding]:
-    return list(references_usable(source))  # type: ignore[arg-type]
+    return list(references_usable(source))
 
 
 @pytest.mark.parametrize(

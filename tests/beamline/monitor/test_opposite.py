@@ -85,12 +85,12 @@ def test_in_a_cone_it_stands_aside_and_says_so_once() -> None:
     assert (flag.level, flag.frame) == (Level.INFO, 10) and "cone" in flag.advice
 
 
-class Interlaced(Moved):
-    """A sample twice as wide as the field, in eight passes over half a turn."""
+class Wide(Moved):
+    """A sample twice as wide as the field, at these angles."""
 
-    def __init__(self, place: Place) -> None:
-        super().__init__(200, place)
-        self.step, self.turns = 1.0, interlaced(320, 8)
+    def __init__(self, turns: NDArray[np.float64], place: Place) -> None:
+        super().__init__(len(turns), place)
+        self.step, self.turns = 1.0, turns
         radius, phase = self.at
         self.at = 2 * radius, phase
 
@@ -109,6 +109,13 @@ class Interlaced(Moved):
 
 def test_a_wide_sample_in_passes_raises_no_flag_while_its_neighbours_are_far_and_shows_a_shift_later() -> None:
     """From one view of the first pass to the next, 4.5 degrees on, the field shows other matter."""
-    flags = only(Interlaced(lambda view: (6.0 * (view >= 170), 0)))
+    flags = only(Wide(interlaced(320, 8)[:200], lambda view: (6.0 * (view >= 170), 0)))
     assert flags and min(flag.frame for flag in flags) >= 10 + 170
     assert [flag.score for flag in flags] == pytest.approx([6] * len(flags), abs=0.5)
+
+
+@pytest.mark.parametrize("jump", [0, 6])
+def test_a_far_step_still_shows_a_jump_that_is_larger_than_what_it_may_miss(jump: int) -> None:
+    """Half a turn in one pass: the first view is compared with the last one, a step before it on the other side."""
+    flags = only(Wide(np.arange(200) * np.pi / 200, lambda view: (jump * (view >= 100), 0)))
+    assert [round(flag.score) for flag in flags] == [jump] * bool(jump)

@@ -63,7 +63,7 @@ def test_a_view_is_corrected_by_the_flats_of_its_part(flats: str, left: float, r
     light = beam * np.choose(keys, [0.5, 1.0, 0.0])
     data = rng.poisson(DARK + light[:, None, None] * np.ones((1, 20, 80))).astype(np.uint16)
     source, said = ArraySource(data, keys.tolist(), np.zeros(keys.size), np.ones(keys.size)), list[str]()
-    source.part_starts = np.array([0, len(first)])
+    source.state(part_starts=np.array([0, len(first)]))
     views = np.flatnonzero(keys == 0)
     found = correction_of(source, PLAIN, said.append).at_once(views)
     truth = np.full(views.size, 0.5)
@@ -105,14 +105,15 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
     used = PLAIN.with_steps(Preparation(ring_current="use"))
     with pytest.raises(ConfigError, match="no ring current"):
         correction_of(source, used)
-    source.currents = current
+    source.state(currents=current)
     off = []
     for selection in (PLAIN, used):
         correction = correction_of(source, selection)
         off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
     assert off[0] > 0.5 and off[1] < 0.01
     assert correction.done["flats"].sentence == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
-    source.currents[2] = np.nan
+    current[2] = np.nan
+    source.state(currents=current)
     with pytest.raises(ConfigError, match="views or flats"):
         correction_of(source, used)
 
@@ -140,11 +141,11 @@ def _exposed(dark: list[float], flat: float, views: np.ndarray, glow: float = GL
 )
 def test_darks_are_dealt_by_exposure(dark: list[float], flat: float) -> None:
     source = _exposed(dark, flat, np.full(45, 0.2))
-    frames, correction = np.flatnonzero(source.image_key == 0), correction_of(source, PLAIN)
+    frames, correction = np.flatnonzero(source.table.kinds == 0), correction_of(source, PLAIN)
     batches = correction.in_batches(frames, np.empty((45, 4, 40), np.float32), 7, lambda n, of: None)
     for found in (correction.at_once(frames), batches):
         np.testing.assert_allclose(found.data, SCAN.line_integrals(), atol=3e-3)
-    assert not list(references_usable(source))  # type: ignore[arg-type]
+    assert not list(references_usable(source))
 
 
 @pytest.mark.parametrize("flat", [0.1, 0.3])
@@ -152,7 +153,7 @@ def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
     views = 0.2 + 0.1 * np.sin(2 * SCAN.angles)
     source = _exposed([0.2], flat, views, glow=0.0)
     correction = correction_of(source, PLAIN)
-    found = correction.at_once(np.flatnonzero(source.image_key == 0)).data
+    found = correction.at_once(np.flatnonzero(source.table.kinds == 0)).data
     np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
     assert correction.done["flats"].sentence.startswith("Exposures of the views: 0.1")
-    assert not list(references_usable(source))  # type: ignore[arg-type]
+    assert not list(references_usable(source))

@@ -42,7 +42,7 @@ def test_every_flag_has_its_frames_its_worst_score_and_its_meaning() -> None:
 
 @pytest.mark.parametrize(("most", "rows"), [(2, [11, 20]), (3, [11, 17, 20]), (30, [5, 8, 11, 14, 17, 20])])
 def test_the_worst_of_each_kind_come_first(most: int, rows: list[int]) -> None:
-    found = worst_frames(source(), flags(), most)  # type: ignore[arg-type]
+    found = worst_frames(source(), flags(), most)
     assert [frame.title for frame in found] == [f"frame {row}, projection, {row:.1f}°" for row in rows]
     (worst,) = [frame for frame in found if "frame 11," in frame.title]
     assert worst.colour == "tab:red" and worst.regions == [(REGION, "tab:red")]
@@ -53,7 +53,7 @@ def test_the_worst_of_each_kind_come_first(most: int, rows: list[int]) -> None:
 def test_means_of_darks_and_flats_and_how_the_beam_changed() -> None:
     frames = np.repeat([10, 12, 110, 112, 60, 60, 70], 6 * 600).reshape(7, 6, 600)
     scan = ArraySource(frames.astype(np.uint16), [2, 2, 1, 1, 0, 0, 1], np.zeros(7))
-    found = reference_images(scan)  # type: ignore[arg-type]
+    found = reference_images(scan)
     levels = {title: (image.shape, float(image.min()), float(image.max())) for title, image in found.items()}
     assert levels == {
         "dark (counts)": ((2, 200), 11, 11),
@@ -61,4 +61,4 @@ def test_means_of_darks_and_flats_and_how_the_beam_changed() -> None:
         "last flats (counts)": ((2, 200), 70, 70),
         "last flats / first": ((2, 200), pytest.approx(0.59), pytest.approx(0.59)),
     }
-    assert reference_images(source()) == {}  # type: ignore[arg-type]
+    assert reference_images(source()) == {}

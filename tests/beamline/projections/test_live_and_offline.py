@@ -125,7 +125,7 @@ def the_same(found: list[Flag], path: Path) -> None:
     """The flags of a run, those in its file and those of the file."""
     with open_scan(path) as source:
         judged = [each.flags for each in replay(source)]
-        written, again = source.flags, FrameFlags.of_flags(judged)
+        written, again = source.table.flags, FrameFlags.of_flags(judged)
     assert list(chain.from_iterable(judged)) == found
     assert_equal(again, written)
 

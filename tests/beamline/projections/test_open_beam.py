@@ -121,3 +121,15 @@ def test_line_integrals_have_no_photons() -> None:
     source.quantity = "line_integrals"
     with pytest.raises(ConfigError, match="not counts"):
         prepare(source, PLAIN.with_steps(Preparation(noise="counts")))
+
+
+@pytest.mark.parametrize("gain", [1.0, 3.0])
+def test_dark_corners_of_the_frame_are_no_lack_of_photons(gain: float) -> None:
+    """A beam that lights less than half of the frame, as behind a round window."""
+    rng, (rows, cols) = np.random.default_rng(4), SCAN.shape
+    window = np.hypot(*np.meshgrid(np.linspace(-1, 1, cols), np.linspace(-1, 1, rows))) < 0.7
+    counts = (DARK + gain * rng.poisson(2000.0 * window * light) for light in np.exp(-np.r_[[0 * EXACT[0]] * 6, EXACT]))
+    frames = np.stack([*counts])
+    darks = rng.normal(DARK, 2, (6, rows, cols)).round()
+    correction = correction_of(scan_of(darks, frames[:6], frames[6:], SCAN.angles, np.float32))
+    assert window.mean() < 0.5 and correction.photons is None

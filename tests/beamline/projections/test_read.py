@@ -24,8 +24,8 @@ def test_rows_of_all_frames_are_read_where_the_pieces_of_a_frame_are_too_many_to
     source.frame_bytes = data.nbytes
     monkeypatch.setattr("beamline.projections.read.HELD", 64)
     monkeypatch.setattr("beamline.projections.read.BATCH_BYTES", 5 * 4 * 4 * 2)
-    got = read_binned(source, np.array([0, 2, 3, 4]), slice(1, 7), binning)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(got, read_binned(plain, np.array([0, 2, 3, 4]), slice(1, 7), binning))  # type: ignore[arg-type]
+    got = read_binned(source, np.array([0, 2, 3, 4]), slice(1, 7), binning)
+    np.testing.assert_array_equal(got, read_binned(plain, np.array([0, 2, 3, 4]), slice(1, 7), binning))
     assert len({tuple(frames) for frames, _ in source.was_read}) == 1 < len({tuple(f) for f, _ in plain.was_read})
 
 
@@ -42,7 +42,7 @@ def test_bins_are_means_of_what_is_finite(rows: int, cols: int, binning: int, ho
     rng = np.random.default_rng(seed)
     data = rng.random((2, rows, cols)).astype(np.float32)
     data[rng.random(data.shape) < holes] = np.nan
-    got = read_binned(ArraySource(data, [0, 0], np.zeros(2)), np.arange(2), slice(0, rows), binning)  # type: ignore[arg-type]
+    got = read_binned(ArraySource(data, [0, 0], np.zeros(2)), np.arange(2), slice(0, rows), binning)
     assert got.shape == (2, rows // binning, cols // binning)
     for v, r, c in np.ndindex(got.shape):
         block = data[v, r * binning : (r + 1) * binning, c * binning : (c + 1) * binning]
@@ -56,8 +56,8 @@ def test_flats_are_grouped_by_the_views_between_them() -> None:
     keys = [2, 1, 1, 0, 0, 0, 1, 3, 1, 0, 2, 1]
     data = np.arange(12, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 2), np.uint16)
     source = ArraySource(data, keys, np.zeros(12))
-    darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))  # type: ignore[arg-type]
-    references = read_references(source, ReferenceGroups(darks, flats, ()), slice(0, 2), Selection())  # type: ignore[arg-type]
+    darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
+    references = read_references(source, ReferenceGroups(darks, flats, ()), slice(0, 2), Selection())
     assert [(position, float(flat[0, 0])) for position, flat in references.flats] == [
         (1.5, 1.5),
         (7.0, 7.0),

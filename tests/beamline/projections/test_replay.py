@@ -37,7 +37,7 @@ def test_a_file_gets_the_flags_that_the_scan_gave_it(tmp_path: Path, passes: int
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10}, lost={12})), angles, "scan.period_s=1.5")
     path = ran.of("scan_done")[0].data["path"]
     with open_scan(path) as source:
-        written = source.flags
+        written = source.table.flags
         assert written is not None and written.flagged.sum() == 2  # the repeats; a lost frame marks no other
         np.testing.assert_array_equal(judged_flags(source).bits, written.bits)
         assert context_of(source).period == pytest.approx(1.5, rel=0.01)
@@ -51,7 +51,7 @@ def test_a_foreign_file_is_judged(tmp_path: Path) -> None:
     counts[20] = rng.poisson(np.full(SCAN.shape, DARK))
     path = write_exchange(tmp_path / "s.h5", SCAN, {"data": counts})
     with open_scan(path) as source:
-        assert source.flags is None
+        assert source.table.flags is None
         found = judged_flags(source)
     assert np.flatnonzero(found.alarmed).tolist() == [24]  # two darks and two flats come before the views
 
@@ -62,7 +62,7 @@ def test_foreign_byte_orders_and_floats_of_16_bits_are_judged_as_the_same_number
     data[20, 3, :5] = 0
     key, angles = [2, 2, 1, 1] + [0] * 30, np.r_[np.zeros(4), SCAN.angles]
     sources = [ArraySource(data.astype(dtype), key, angles) for dtype in ("f4", ">u2", "f2")]
-    flags, *others = [[each.flags for each in replay(source)] for source in sources]  # type: ignore[arg-type]
+    flags, *others = [[each.flags for each in replay(source)] for source in sources]
     assert any(flags)
     assert others == [flags, flags]
 
@@ -84,8 +84,8 @@ def test_pixels_and_angles_that_are_no_measurement_are_named_and_nothing_else_fa
     else:
         data[own[rows]] = value
     source = ArraySource(data, [2, 2, 1, 1] + [0] * 30, angles)
-    judged = list(replay(source))  # type: ignore[arg-type]
-    found = verdict(source, judged)  # type: ignore[arg-type]
+    judged = list(replay(source))
+    found = verdict(source, judged)
     flags = [flag for each in judged for flag in each.flags]
     assert all(math.isfinite(flag.score) for flag in flags)
     said = [*(flag.advice for flag in flags), *found.references]
@@ -99,7 +99,7 @@ def test_line_integrals_are_judged_as_counts_of_a_beam_and_nothing_is_said_of_li
     views[17] += 3.0
     source = ArraySource(views, [0] * 30, SCAN.angles)
     source.quantity = "line_integrals"
-    flags = [flag for each in replay(source) for flag in each.flags]  # type: ignore[arg-type]
+    flags = [flag for each in replay(source) for flag in each.flags]
     assert {17} == {flag.frame for flag in flags if flag.level is Level.ALARM}
     advice = [flag.advice for flag in flags if flag.check == "beam"]
     assert any("+0.1 off" in text for text in advice)

@@ -39,8 +39,8 @@ class Changed:
         row, col = np.mgrid[: self.source.shape[0], : self.source.shape[1]].astype(float)
         images = self.source.read(rows).astype(np.float32)
         for image, at in zip(images, rows, strict=True):
-            if self.source.image_key[at] == FrameKind.PROJECTION:
-                image *= self.share(int((self.source.image_key[:at] == FrameKind.PROJECTION).sum()), row, col)
+            if self.source.table.kinds[at] == FrameKind.PROJECTION:
+                image *= self.share(int((self.source.table.kinds[:at] == FrameKind.PROJECTION).sum()), row, col)
         return images
 
 

@@ -80,7 +80,7 @@ def test_a_sample_beside_the_axis_that_leaves_the_field_and_comes_back_is_named_
 def test_a_ring_current_that_nothing_corrects_is_told(radius: float, ring_current: str, of_current: list[bool]) -> None:
     current = np.linspace(200, 150, VIEWS)
     source = scan(radius, current[:, None, None] / 200)
-    source.currents = np.r_[np.full(10, 200.0), current]
+    source.state(currents=np.r_[np.full(10, 200.0), current])
     _, told = prepare(source, SELECTION.with_steps(Preparation(ring_current=ring_current)))
     assert ["varies from 150 to 200, 33%" in line for line in told if "ring current" in line] == of_current
 

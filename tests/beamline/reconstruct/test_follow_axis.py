@@ -17,9 +17,10 @@ from beamline.reconstruct import followed_views
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
+from drivers.base.frame import FrameKind
 from recon.prep.align import AxisEstimate
 from tests.beamline.reconstruct.growing_scan import BRIEF, FIT, INTERLACED, SCAN, ScanClock, options, schedule
-from tests.beamline.scans import frames_of
+from tests.beamline.scans import DARK, TwoCylinders, frames_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -40,6 +41,20 @@ def test_the_axis_is_found_while_the_views_come(tmp_path: Path) -> None:
     started = [event.data for event in events if event.event == "recon_started"]
     assert started[0]["n_views"] < 30
     assert events[-1].data["axis_col"] == pytest.approx(SCAN.axis_col, abs=0.3)
+
+
+def test_a_post_that_shows_itself_at_the_end_does_not_draw_the_axis_away(tmp_path: Path) -> None:
+    """That it comes and goes is known when all views are there; they are corrected again, and the axis with them."""
+    scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 3.0)), shape=(6, 64), pixel_size_mm=0.5)
+    frames = frames_of(scan)
+    views = [at for at, frame in enumerate(frames) if frame.kind is FrameKind.PROJECTION]
+    for at, middle in zip(views, scan.axis_col + 34 * np.cos(scan.angles + 0.3), strict=True):
+        frames[at].counts[:, np.abs(np.arange(64) - middle) < 6] = DARK
+    clock, events = ScanClock(), list[Event]()
+    schedule(clock, tmp_path / "scan.h5", frames)
+    reconstruct_file(options(tmp_path, selection=Selection(), method=BRIEF), events.append, clock)
+    states = [event.data["state"] for event in events if event.event == "state"]
+    assert "correcting" in states and events[-1].data["axis_col"] == pytest.approx(scan.axis_col, abs=0.2)
 
 
 def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -68,11 +83,13 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
     looks, told = list[int](), list[str]()
     warn = Warnings(lambda event: told.append(event.data["message"]), SystemClock())
     correction: Any = None
-    source: Any = SimpleNamespace(angles=np.radians(np.arange(0, 360, 1.8)), axis_col=None, cone=None)
+    source: Any = SimpleNamespace(
+        table=SimpleNamespace(angles=np.radians(np.arange(0, 360, 1.8))), axis_col=None, cone=None
+    )
 
     def locate(source: Any, correction: object, frames: np.ndarray, *_: object, **__: object) -> Any:
         looks.append(frames.size)
-        sure = source.angles[frames[-1]] > np.radians(175)
+        sure = source.table.angles[frames[-1]] > np.radians(175)
         return 20.7, AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), sure, "ends of half a turn")
 
     monkeypatch.setattr(followed_views, "locate_axis", locate)

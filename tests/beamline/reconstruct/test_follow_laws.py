@@ -234,7 +234,7 @@ def test_views_that_the_fit_leaves_out_have_no_part_and_repeated_angles_stay(
     assert shares == [(0.25, 0.2), (0.25 / 0.8, 0.0)]  # wide views make known what lies beside the field
 
 
-def test_the_pass_before_wide_views_is_not_measured_again_and_the_volume_says_that_they_are_not_in_it(
+def test_the_pass_before_wide_views_is_not_measured_again_and_they_are_among_the_views_of_the_volume(
     laws: Laws, follow: Callable[..., Followed]
 ) -> None:
     wide = [replace(frame, kind=FrameKind.WIDE_VIEW, aside=18.0, index=14 + i) for i, frame in enumerate(FRAMES[4:7])]
@@ -242,8 +242,10 @@ def test_the_pass_before_wide_views_is_not_measured_again_and_the_volume_says_th
     for n in (14, 3):
         scan.seconds(n)
     assert laws.sizes == [[10], [10, 10]]
-    scan.follower.prepared()
-    assert any("3 wide views of this scan are not used" in warned["message"] for warned in scan.of("warning"))
+    prepared = scan.follower.prepared()
+    assert prepared.geometry.ordinary.tolist() == [True] * 10 + [False] * 3
+    np.testing.assert_allclose(prepared.geometry.shifts[:, 0] * prepared.geometry.pixel_pitch, [0] * 10 + [18.0] * 3)
+    assert (prepared.n_projections, prepared.ordinary.geometry.n_views) == (10, 10)
 
 
 def test_a_view_that_was_taken_again_has_no_part_though_the_fit_has_learnt_it(
@@ -306,7 +308,8 @@ def test_a_law_waits_for_views_of_its_pass_that_may_show_the_axis(
     """The end of a pass is read after the number of frames: the file may have grown in between."""
     scan = follow(changes={"selection": Selection()})
     monkeypatch.setattr(scan.follower, "_cursor", Cursor(frames=13))
-    scan.follower.source.pass_ends = np.array([14])
+    source = scan.follower.source
+    source.table = replace(source.table, pass_ends=np.array([14]))
     scan.follower.measure_law()
     assert not scan.of("error_law")
 

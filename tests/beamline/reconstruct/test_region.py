@@ -46,7 +46,7 @@ def whole(made: Path) -> Callable[..., ReconRecord]:
     [
         (("-m", "fbp"), 1e-5),
         (("-m", "fbp", "--memory", "2.5M"), 1e-5),
-        (("-m", "sirt", "--iterations", "3"), 1e-5),
+        pytest.param(("-m", "sirt", "--iterations", "3"), 1e-5, marks=pytest.mark.slow),
         (("-m", "fista-tv", "--iterations", "5", "--tv-weight", "0.002"), 2e-3),
     ],
     ids=["fbp", "fbp in slabs", "sirt", "fista-tv"],

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import json
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from beamline.projections.selection import Selection
+from beamline.reconstruct.memory import recon_memory_of
+from beamline.reconstruct.options import OutputPaths, ReconOptions
+from beamline.reconstruct.plan import prepare_within
+from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.writers.recon_file import read_reconstruction
+from recon.voxels.direct import Fbp
 from tests.beamline.cli.small_scan import beamline, left
+from tests.beamline.reconstruct.growing_scan import ScanClock
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 
@@ -38,8 +46,8 @@ def volume(*options: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("memory", "more"),
     [
-        ("3M", []),
         ("2M", ["--bin", "2"]),
+        pytest.param("3M", [], marks=pytest.mark.slow),
         pytest.param("3M", ["--rows", "33:181"], marks=pytest.mark.slow),
         pytest.param("3M", ["--air", "none"], marks=pytest.mark.slow),
     ],
@@ -60,6 +68,26 @@ def test_the_volume_is_the_same_to_the_bit_in_as_many_slabs_as_its_dry_run_says(
     assert parts.metrics["residual"] == pytest.approx(whole.metrics["residual"], rel=1e-6)
     assert parts.parameters["replaced_fraction"] == pytest.approx(whole.parameters["replaced_fraction"])
     assert left(tmp_path) == {"scan.h5", "whole.h5", "parts.h5"}
+
+
+def test_weights_of_pixels_that_measured_nothing_are_in_the_plan(tmp_path: Path) -> None:
+    """They are known when views are read; a volume that no longer fits is then made in slabs."""
+    scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 3.0)), shape=(96, 48), axis_col=23.7)
+    counts = scan.counts()
+    write_exchange(tmp_path / "whole.h5", scan, {"data": counts})
+    counts[::2, :, :5] = 0
+    write_exchange(tmp_path / "scan.h5", scan, {"data": counts})
+    views, slabs = counts.size * 4, {}
+    for name in ("whole.h5", "scan.h5"):
+        options = ReconOptions(
+            SourceOptions(tmp_path / name), OutputPaths(tmp_path / "v.h5", None), Selection(axis_col=23.7), Fbp()
+        )
+        with open_scan(tmp_path / name) as source:
+            needs = recon_memory_of(source, options)
+            limited = replace(options, memory=needs.at_once + views)
+            _, plan = prepare_within(source, limited, lambda _: None, ScanClock(), lambda _: None)
+        slabs[name] = len(plan.slabs), plan.needs.weights
+    assert slabs["whole.h5"] == (0, 0) and slabs["scan.h5"][0] > 1 and slabs["scan.h5"][1] == 2 * views
 
 
 @pytest.mark.slow

@@ -118,7 +118,7 @@ def test_a_series_that_was_stopped_goes_on(
     assert [scan["energy_kev"] for scan in said["scans"]] == list(ENERGIES)
     for scan in said["scans"]:
         with open_scan(Path(scan["path"])) as source:
-            kinds = source.image_key
+            kinds = source.table.kinds
             assert (kinds == FrameKind.PROJECTION).sum() == VIEWS
     assert all(digests(series)[name] == before[name] for name in whole)
     with monkeypatch.context() as without:

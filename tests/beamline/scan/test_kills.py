@@ -26,8 +26,8 @@ from beamline.plan.passes import Choice
 from beamline.scan import recorder
 from beamline.scan.resume import open_for_resume, recover_run
 from beamline.scan.run import run_scan
-from beamline.storage.parts import decisions_in, pass_ends_in
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.recorded_frames import decisions_in, pass_ends_in
 from beamline.storage.writer_lock import QUIET
 from drivers.base.frame import FrameKind
 from tests.beamline.chosen import Chooser, Scripted, choosing
@@ -142,7 +142,7 @@ def _gone_on(run: Path) -> bool:
     _assert_frames(run / "joined.h5", one_part=False)
     assert not [one for one in validate(run / "joined.h5", lambda done, of: None) if one.severity == "error"]
     with open_scan(run / "joined.h5") as source:
-        assert (source.image_key == FrameKind.PROJECTION).sum() == VIEWS
+        assert (source.table.kinds == FrameKind.PROJECTION).sum() == VIEWS
     return True
 
 
@@ -168,10 +168,15 @@ def test_kills_of_a_scan_that_decides(tmp_path: Path, monkeypatch: pytest.Monkey
         with open_scan(run / "joined.h5") as source:
             frames = [frame for frame in source.frames() if frame.kind is FrameKind.PROJECTION]
             assert [values["choice"] for values in source.decisions] == script
-            assert [sum(frame.index < end for frame in frames) // PASS for end in source.pass_ends] == [1, 2, 3, 4]
+            assert [sum(frame.index < end for frame in frames) // PASS for end in source.table.pass_ends] == [
+                1,
+                2,
+                3,
+                4,
+            ]
             of_parts = SourceOptions(run / "part-2" / "scan.h5", earlier=(run / "scan.h5",))
             with open_scan(of_parts) as followed:  # as a live reconstruction reads them
-                assert followed.pass_ends.tolist() == source.pass_ends.tolist()
+                assert followed.table.pass_ends.tolist() == source.table.pass_ends.tolist()
                 assert followed.decisions == source.decisions
         assert_true(frames)
         once = [*range(PASS)]

@@ -29,8 +29,8 @@ from beamline.scan.resume import NothingMissing, NotJoined, open_for_resume, rec
 from beamline.scan.run import run_scan
 from beamline.scan.supervision import Supervision
 from beamline.storage.interrupted import next_step
-from beamline.storage.parts import decisions_in, pass_ends_in
 from beamline.storage.readers.open import open_scan
+from beamline.storage.recorded_frames import decisions_in, pass_ends_in
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import ending_in
 from drivers.base.frame import Frame, FrameKind
@@ -368,7 +368,7 @@ def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
         with open_scan(ran.folder / "joined.h5") as source:
             assert [values["number"] for values in source.decisions] == [1, 2]
             views = [frame.index for frame in source.frames() if frame.kind is FrameKind.PROJECTION]
-            assert [sum(row < end for row in views) for end in source.pass_ends] == [sizes[0], sum(sizes[:2])]
+            assert [sum(row < end for row in views) for end in source.table.pass_ends] == [sizes[0], sum(sizes[:2])]
         with pytest.raises(NothingMissing), open_for_resume(ran.folder):
             ...
 
@@ -389,7 +389,7 @@ def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
     for file in (path, tmp_path / "copy.h5"):
         assert [finding.message for finding in validate(file) if finding.severity != "info"] == []
         with open_scan(file) as source:
-            assert source.pass_ends.tolist() == [13, 21, 25, 33, 41]
+            assert source.table.pass_ends.tolist() == [13, 21, 25, 33, 41]
             assert [values["choice"] for values in source.decisions] == chooser.answers
             assert usable_views(source, use_flags=True).frames.size == 32
             assert judged_flags(source).flagged.sum() == 0

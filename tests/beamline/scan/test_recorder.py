@@ -175,7 +175,7 @@ def test_an_abort_does_not_wait_for_a_disk_that_hangs_and_no_frame_is_lost(
     ran = Ran(tmp_path, instrument, "scan.mode=step", stop=stop)
     assert type(ran.error) is ScanAborted and 0 < seconds[-1] < 2
     with open_scan(tmp_path / ran.folder / "scan.h5") as source:
-        assert len(source.image_key) == instrument.camera.number
+        assert len(source.table.kinds) == instrument.camera.number
 
 
 def test_flags_are_stored_with_the_row_and_told_once(tmp_path: Path) -> None:

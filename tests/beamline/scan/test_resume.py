@@ -32,7 +32,7 @@ from beamline.scan.run import run_scan
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.interrupted import whole_scan
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.replacements import overlaid
+from beamline.storage.readers.reference_files import overlaid
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
@@ -171,7 +171,7 @@ def _assert_told_of_parts(run: Path) -> None:
             checked_views(source, Selection(steps=(Preparation(references="accept"),)), lambda _: None)
         assert whole_scan(part) == run / "joined.h5" == watched(part).scan
     with closing(Reader(watched(run))) as reader:
-        assert reader.state()["frames"] == open_scan(run / "joined.h5").image_key.size
+        assert reader.state()["frames"] == open_scan(run / "joined.h5").table.kinds.size
     facts = describe(run / "joined.h5")
     assert not any("parts of a scan" in finding for finding in facts["findings"])
     assert facts["kinds"]["projection"] == VIEWS
@@ -188,9 +188,9 @@ def test_the_views_of_all_parts_are_corrected_together(run: Path, tmp_path: Path
     for path in (run / "joined.h5", tmp_path / "ingested.h5"):
         with open_scan(path) as source, h5py.File(run / "scan.h5") as part:
             frames = int(part[layout.COMMITTED][()])
-            assert source.part_starts.tolist() == [0, frames]
-            assert overlaid(source, darks=images).part_starts.tolist() == [0, frames + 2]
-            assert overlaid(source, flats=images).part_starts.tolist() == [0]
+            assert source.table.part_starts.tolist() == [0, frames]
+            assert overlaid(source, darks=images).table.part_starts.tolist() == [0, frames + 2]
+            assert overlaid(source, flats=images).table.part_starts.tolist() == [0]
     with open_scan(run / "joined.h5") as source:
         selection = Selection(axis_col=5.5, steps=(Air("none"), Preparation("ignore")))
         prepared = prepare_projections(source, selection, lambda said: None)
@@ -336,7 +336,7 @@ def test_a_new_part_that_took_nothing_does_not_matter(run: Path) -> None:
         assert list(series.left_out) == left_out
     _go_on(run)
     with open_scan(run / "joined.h5") as source:
-        assert (source.image_key == FrameKind.PROJECTION).sum() == VIEWS
+        assert (source.table.kinds == FrameKind.PROJECTION).sum() == VIEWS
 
 
 def test_a_part_counts_by_its_file_where_its_events_were_lost(run: Path) -> None:

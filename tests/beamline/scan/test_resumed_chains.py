@@ -193,7 +193,7 @@ def test_the_joined_file_has_all_frames_or_is_refused(
             assert is_joined(joined)
         try:
             with open_scan(joined) as source:
-                assert source.image_key.size == _frames(made.run)
+                assert len(source.table) == _frames(made.run)
         except DataError as refused:
             assert "recover" in str(refused) or not joined.exists()
     if chain[-1][0] != "unjoined_whole":
@@ -269,7 +269,7 @@ def test_a_joined_file_whose_parts_changed_is_refused_and_made_again(
         open_scan(recovered)
     recover_run(recovered.parent)
     with open_scan(recovered) as source:
-        assert source.image_key.size == _frames(recovered.parent)
+        assert len(source.table) == _frames(recovered.parent)
 
 
 def test_a_run_is_copied_as_a_whole_and_its_copy_needs_no_part(recovered: Path, tmp_path: Path) -> None:
@@ -283,7 +283,7 @@ def test_a_run_is_copied_as_a_whole_and_its_copy_needs_no_part(recovered: Path, 
     shutil.copy(tmp_path / "archive.h5", recovered.parent / "archive.h5")
     shutil.copy(tmp_path / "archive.h5", tmp_path / "alone" / JOINED)
     with open_scan(recovered) as source:
-        n = source.image_key.size
+        n = len(source.table)
         for copy in (tmp_path / "archive.h5", recovered.parent / "archive.h5", tmp_path / "alone" / JOINED):
             with open_scan(copy) as archived:
                 np.testing.assert_array_equal(archived.read(slice(None)), source.read(slice(None)))

@@ -55,10 +55,10 @@ def test_each_view_with_an_alarm_is_taken_again_at_its_angle(mode: str, repeats:
             views = usable_views(source, use_flags=True).frames
             left = repeats - {frame.replaces for frame in again}
             assert views.size == N - len(left)
-            steps = np.degrees(source.angles[views]) / 11.25
+            steps = np.degrees(source.table.angles[views]) / 11.25
             assert np.unique(np.rint(steps)).size == views.size and np.abs(steps - np.rint(steps)).max() < 0.002
             # The same checks over the file find the same: a view taken again is no late trigger.
-            flags, judged = source.flags, judged_flags(source)
+            flags, judged = source.table.flags, judged_flags(source)
             assert flags is not None
             np.testing.assert_array_equal(judged.alarmed, flags.alarmed)
 
@@ -115,8 +115,8 @@ def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Pa
         again = [frame.replaces for frame in source.frames() if frame.replaces >= 0]
         assert again == [8, 10, 12][: len(again)] and len(again) in (2, 3)
         left = [row for row in (8, 10, 12, 14) if row not in again]
-        flags = source.flags
-        assert flags is not None and (source.image_key[left] == FrameKind.PROJECTION).all()
+        flags = source.table.flags
+        assert flags is not None and (source.table.kinds[left] == FrameKind.PROJECTION).all()
         assert flags.alarmed[left].all()
     with open_for_resume(ran.folder) as series:
         assert series.retaken == len(again)  # which count in the dose and the share of the run
@@ -127,7 +127,7 @@ def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:
     assert (ran.result.retaken, ran.result.missing, ran.result.alarmed_frames) == (1, (), 1)
     assert "Frames 8 gave no frame" in ran.warnings[0]
     with open_scan(ran.result.path) as source:
-        assert source.image_key[8] == FrameKind.PROJECTION and source.image_key[10] == FrameKind.INVALID
+        assert source.table.kinds[8] == FrameKind.PROJECTION and source.table.kinds[10] == FrameKind.INVALID
 
 
 @pytest.mark.parametrize("mode", ["fly", "step"])
@@ -137,8 +137,8 @@ def test_a_view_that_gave_no_frame_is_taken_again_under_its_trigger(tmp_path: Pa
     assert (ran.result.retaken, ran.result.missing) == (1, ())
     with open_scan(ran.result.path) as source:
         again = FIRST + N - 1
-        assert source.image_key[again] == FrameKind.PROJECTION
-        assert np.degrees(source.angles[again]) == pytest.approx(3 * 11.25, abs=0.01)
+        assert source.table.kinds[again] == FrameKind.PROJECTION
+        assert np.degrees(source.table.angles[again]) == pytest.approx(3 * 11.25, abs=0.01)
         views = usable_views(source, use_flags=True).frames
         assert views.size == N and again in views
     with h5py.File(ran.result.path) as file:

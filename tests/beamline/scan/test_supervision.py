@@ -107,7 +107,7 @@ def test_a_loss_of_beam_read_after_the_last_frame_of_a_block_is_mended(tmp_path:
         kinds = [FrameKind.FLAT if block is State.FLATS else FrameKind.PROJECTION]
         again = [frame for frame in source.frames() if frame.replaces >= 0]
         assert again and {frame.kind for frame in again} == set(kinds)
-        assert (source.image_key == FrameKind.PROJECTION).sum() == 12
+        assert (source.table.kinds == FrameKind.PROJECTION).sum() == 12
     frames = ran.of("frame")
     assert all(event.data["n"] <= event.data["of"] for event in frames)
     assert frames[-1].data["n"] == frames[-1].data["of"] == ran.result.n_frames

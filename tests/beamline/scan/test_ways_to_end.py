@@ -92,7 +92,7 @@ def _ran(runs: Path, place: str, which: int, nth: int, once: bool = False, mode:
 def _stored(run: Path | None) -> int:
     try:
         with open_scan((run or Path()) / "scan.h5") as source:
-            return len(source.image_key) if source.finished else 0
+            return len(source.table.kinds) if source.finished else 0
     except (BeamlineError, OSError):
         return 0
 

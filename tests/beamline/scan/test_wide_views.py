@@ -222,7 +222,7 @@ def test_a_scan_that_is_resumed_has_them_and_its_copy_too(at: str, tmp_path: Pat
         run_scan(asked(*WIDE), tmp_path, [hear], stop)
     (folder,) = tmp_path.iterdir()
     with open_scan(folder / "scan.h5") as source:
-        assert ((source.image_key == FrameKind.PROJECTION).sum() == VIEWS) == (at == "wide_view")
+        assert ((source.table.kinds == FrameKind.PROJECTION).sum() == VIEWS) == (at == "wide_view")
     with open_for_resume(folder) as series:
         joined = run_scan(series.config, series, []).path
     ingest(joined, tmp_path / "copy.h5")

@@ -30,8 +30,8 @@ from beamline.core.errors import DataError
 from beamline.features.files.validate import describe, validate
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
-from beamline.storage.parts import views_in
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.recorded_frames import frames_in
 from beamline.storage.recover import recover
 from beamline.storage.volumes.images import tiff
 from beamline.storage.volumes.zarr import ome_zarr
@@ -155,7 +155,7 @@ class Rig:
 
     def resume(self) -> int:
         with hdf5.open_hdf5(self.scan) as file:
-            views_in(file)
+            frames_in(file).numbers_taken()
             return int(file[layout.COMMITTED][()])
 
     def after(self) -> list[int]:
@@ -163,10 +163,10 @@ class Rig:
         with h5py.File(self.scan) as file:
             views = len(file["exchange/data"]) if "exchange/data" in file else 0
         with open_scan(self.scan) as source:
-            n = int(source.image_key.size)
+            n = len(source.table)
             assert source.finished
             assert all((source.read([i])[0] == FRAMES[i].counts).all() for i in range(n))
-            assert views in (0, np.sum(source.image_key == FrameKind.PROJECTION))
+            assert views in (0, np.sum(source.table.kinds == FrameKind.PROJECTION))
         assert views < 2 or not [found for found in validate(self.scan) if found.severity == "error"]
         return [n, views]
 

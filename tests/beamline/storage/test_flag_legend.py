@@ -71,7 +71,7 @@ def test_info_counts_by_the_legend_of_the_file_and_not_the_checks_of_this_progra
 
 def test_scores_and_regions_stand_beside_the_bits(path: Path, tmp_path: Path) -> None:
     with open_scan(path) as source, open_scan(ingest(path, tmp_path / "again.h5").path) as again:
-        for flags in (source.flags, again.flags):
+        for flags in (source.table.flags, again.table.flags):
             assert flags is not None and flags.scores is not None and flags.regions is not None
             beam, mass = NAMES.index("beam"), NAMES.index("mass")
             np.testing.assert_array_equal(flags.scores[:, beam], [np.nan, 1.5, 3.0, np.nan])

@@ -34,7 +34,7 @@ def test_followers_see_frames_when_they_are_flushed(tmp_path: Path, clock: Stepp
         with pytest.raises(IndexError, match=r"only 0\.\.5"):
             source.read([6])
         np.testing.assert_array_equal(source.read(slice(None)), [frame.counts for frame in frames[:6]])
-        np.testing.assert_array_equal(source.image_key, [2, 2, 1, 1, 1, 0])
+        np.testing.assert_array_equal(source.table.kinds, [2, 2, 1, 1, 1, 0])
     writer.close()
 
 

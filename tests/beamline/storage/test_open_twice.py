@@ -37,8 +37,8 @@ def append(writer: NXtomoWriter, n: int) -> None:
 
 def is_as_written(source: ScanSource, n: int) -> bool:
     triggers = [frame.trigger for frame in source.frames()]
-    angles = np.allclose(source.angles, 0.001 * np.arange(n))
-    return source.refresh() == n and not source.altered and angles and triggers == [*range(n)]
+    angles = np.allclose(source.table.angles, 0.001 * np.arange(n))
+    return source.refresh() == n and not source.table.altered.any() and angles and triggers == [*range(n)]
 
 
 def other_program(path: Path) -> subprocess.Popen[str]:

@@ -68,6 +68,7 @@ def test_what_changes_nothing_leaves_the_type(tmp_path: Path, attributes: dict[s
     [
         ({"scale_factor": 0.0}, "scale_factor 0"),
         ({"scale_factor": "abc"}, "scale_factor 'abc'"),
+        ({"scale_factor": [2.0, 3.0]}, "scale_factor 2. 3."),
         ({"add_offset": NAN}, "add_offset nan"),
         ({"scale": 2.0, "offset": 1.0}, "scale 2. and offset 1."),
     ],
@@ -92,8 +93,8 @@ def test_every_dataset_of_a_scan_is_packed_for_itself(tmp_path: Path) -> None:
     with open_scan(tmp_path / "s.h5") as source:
         assert (source.dtype, source.quantity) == (np.float32, "counts")
         for kind, (array, scale) in zip((0, 1, 2), packed.values(), strict=True):
-            np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == kind)), scale * array)
-        np.testing.assert_allclose(np.degrees(source.angles[-5:]), [0, 36, 72, 108, 144])
+            np.testing.assert_array_equal(source.read(source.table.of_kind(kind)), scale * array)
+        np.testing.assert_allclose(np.degrees(source.table.angles[-5:]), [0, 36, 72, 108, 144])
 
 
 def test_a_scan_of_cil_and_its_cone(tmp_path: Path) -> None:
@@ -116,6 +117,30 @@ def test_a_scan_of_cil_and_its_cone(tmp_path: Path) -> None:
     options = SourceOptions(tmp_path / "s.nxs", data_path=f"{entry}/data/data", angles_path=f"{entry}/config/angles")
     with open_scan(options) as source:
         np.testing.assert_allclose(source.read(slice(None)), values, atol=1 / scale)
-        np.testing.assert_allclose(np.degrees(source.angles), np.arange(9) * 40.0)
+        np.testing.assert_allclose(
+            np.degrees(source.table.angles), np.arange(9) * -40.0
+        )  # of the view, not of the object
         assert (source.cone, source.pixel_size_mm) == ((20, 40), 0.2)
         assert source.central_ray == pytest.approx((3.5 - 0.4 / 0.2, 5.5))
+
+
+@pytest.mark.parametrize("said", [False, True])
+def test_sources_of_a_virtual_dataset_that_are_packed(tmp_path: Path, said: bool) -> None:
+    """HDF5 gives their stored numbers: these are refused by name, unless the dataset itself says how they are read."""
+    stored = np.arange(24, dtype=np.int16).reshape(2, 3, 4)
+    layout = h5py.VirtualLayout((4, 3, 4), np.int16)
+    for n in range(2):
+        with h5py.File(tmp_path / f"part_{n}.h5", "w") as file:
+            file["d"] = stored + n
+            file["d"].attrs["scale_factor"] = 0.5
+        layout[2 * n : 2 * n + 2] = h5py.VirtualSource(tmp_path / f"part_{n}.h5", "d", stored.shape)
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        whole = file.create_virtual_dataset("d", layout)
+        whole.attrs.update({"scale_factor": 0.5} if said else {})
+    scan = SourceOptions(tmp_path / "s.h5", data_path="d", angles=np.arange(4.0))
+    if said:
+        with open_scan(scan) as source:
+            np.testing.assert_array_equal(source.read(slice(None)), 0.5 * np.concatenate([stored, stored + 1]))
+    else:
+        with pytest.raises(DataError, match=r"/d in .*s.h5 draws on d in .*part_0.h5, whose attributes \(scale_factor"):
+            open_scan(scan)

@@ -14,8 +14,8 @@ from beamline.core.errors import DataError
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.projections.replay import replay
-from beamline.storage.parts import views_in
 from beamline.storage.readers.open import open_scan
+from beamline.storage.recorded_frames import frames_in
 from beamline.storage.recover import recover
 from beamline.storage.writers import layout
 from drivers.base.frame import Frame, FrameKind
@@ -35,13 +35,13 @@ def _flip(path: Path, column: str, row: int, bit: int) -> None:
 def test_one_flipped_bit_is_found_and_its_frame_is_left_out(path: Path, frames: list[Frame], column: str) -> None:
     _flip(path, column, ROW, 8 * np.dtype(layout.COLUMNS[column][0]).itemsize - 3)
     with open_scan(path) as source:
-        assert source.altered == {ROW}
-        assert np.flatnonzero(source.image_key == FrameKind.INVALID).tolist() == [ROW]
+        assert np.flatnonzero(source.table.altered).tolist() == [ROW]
+        assert np.flatnonzero(source.table.kinds == FrameKind.INVALID).tolist() == [ROW]
         assert sum(1 for _ in replay(source)) == len(frames)  # and does not count to 2**61
     assert [f.severity for f in validate(path) if f.rule == "records"] == ["error"]
     assert any("Look for a good copy" in said for said in describe(path)["findings"])
     with h5py.File(path) as file:
-        assert len(views_in(file)) == sum(frame.kind is FrameKind.PROJECTION for frame in frames) - 1
+        assert len(frames_in(file).numbers_taken()) == sum(frame.kind is FrameKind.PROJECTION for frame in frames) - 1
     with pytest.raises(DataError, match=rf"it: {ROW}\..* Nothing was written"):
         ingest(path, path.with_name("copy.h5"))
 
@@ -61,8 +61,8 @@ def test_a_view_that_was_taken_again_keeps_its_checksum(write: Write, frames: li
     again = replace(frames[ROW], index=len(frames), time=frames[-1].time + 1, replaces=ROW)
     path = write([*frames, again])
     with open_scan(path) as source:
-        assert source.altered == frozenset()
-        assert source.image_key[ROW] == FrameKind.INVALID
+        assert not source.table.altered.any()
+        assert source.table.kinds[ROW] == FrameKind.INVALID
     _flip(path, layout.TRIGGER, ROW, 1)
     with open_scan(path) as source:
-        assert source.altered == {ROW}
+        assert np.flatnonzero(source.table.altered).tolist() == [ROW]

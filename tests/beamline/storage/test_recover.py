@@ -190,7 +190,7 @@ def test_a_block_that_a_kill_left_half_written_is_made_whole(
                 patched.setattr("beamline.storage.disk_file.mend_checksum", lambda at, read: None)
                 recover(_aged(died))
             with open_scan(died) as source:  # while HDF5 itself would wait for ever for a writer to end the block
-                assert source.image_key.size == k
+                assert len(source.table) == k
             done = recover(died)
             assert (done.frames, done.damaged, done.altered) == (k, (), ())
             with open_scan(died) as source:
@@ -254,7 +254,7 @@ def test_a_loss_of_power_that_kept_some_of_the_last_writes_takes_no_frame_that_w
             wrong = {row for row, image in enumerate(pixels) if (image != frames[row].counts).any()}
             assert wrong <= {*done.damaged} - {*range(on_disk)} and source.ending.status == "failed"
             angles = [frame.angle for frame in frames[:on_disk]]
-            np.testing.assert_allclose(source.angles[:on_disk], angles, rtol=1e-15)  # stored in degrees
+            np.testing.assert_allclose(source.table.angles[:on_disk], angles, rtol=1e-15)  # stored in degrees
         assert "unreadable" not in {found.rule for found in validate(folder / "s.h5", lambda n, total: None)}
         if (kept := folder / "s.h5.damaged").exists():
             assert kept.read_bytes() == state and f"The damaged file is {kept} now" in done.in_words()
@@ -275,7 +275,7 @@ def test_a_file_of_another_program_that_died_is_read_as_it_is_and_not_recovered(
     subprocess.run([sys.executable, "-c", code], check=False)
     died = _aged(tmp_path / "d.h5")
     with open_scan(SourceOptions(died, angles_path="/exchange/theta", angles_unit="deg")) as source:
-        np.testing.assert_allclose(np.degrees(source.angles), np.arange(60))
+        np.testing.assert_allclose(np.degrees(source.table.angles), np.arange(60))
     with pytest.raises(DataError, match=r"not a scan of this program.*Nothing was changed"):
         recover(died)
 

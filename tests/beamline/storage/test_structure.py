@@ -18,7 +18,7 @@ from beamline.storage import datasets, structure
 from beamline.storage.hdf5 import open_hdf5
 from beamline.storage.readers.images import tiff_series
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from beamline.storage.volume_file import read_volume
 from drivers.base.frame import Frame, FrameKind
 
@@ -71,7 +71,7 @@ def test_links_to_nothing_to_folders_to_itself_and_in_circles_do_no_harm(path: P
         file["entry/soft"] = h5py.SoftLink("/entry/soft")
         file["entry/circle"] = file["entry"]
     with open_scan(path) as source:
-        assert source.image_key.size == len(frames)
+        assert len(source.table) == len(frames)
 
 
 def test_a_file_whose_root_group_is_damaged_is_an_error_of_the_data(path: Path) -> None:

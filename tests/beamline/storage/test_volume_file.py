@@ -107,7 +107,7 @@ def test_a_volume_that_memory_cannot_hold_is_refused_before_it_is_read(
     with h5py.File(tmp_path / "v.h5", "w") as file:
         file["volume"] = VALUES
     read_volume(tmp_path / name)
-    monkeypatch.setattr("beamline.storage.volume_file.free_memory", lambda: VALUES.nbytes - 1)
+    monkeypatch.setattr("beamline.storage.array_file.free_memory", lambda: VALUES.nbytes - 1)
     with pytest.raises(DataError, match=r"holds 4\.8e-08 GB"):
         read_volume(tmp_path / name)
 

@@ -142,7 +142,7 @@ class Scanned:
         """(trigger, angle in counts, framestamp's four bits in the pixels) of each projection in the file."""
         with open_scan(self.path) as source, h5py.File(self.path) as file:
             triggers = file["entry/frame_log/trigger"][()]
-            assert len(triggers) == len(source.image_key)
+            assert len(triggers) == len(source.table.kinds)
             return [
                 (int(triggers[row]), frame.angle / COUNT, int(frame.counts[0, 0]) >> 12)
                 for row, frame in enumerate(source.frames())

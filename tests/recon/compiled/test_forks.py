@@ -1,11 +1,14 @@
-"""A process that is forked after kernels have run computes the same, on one thread; a fork waits for a compilation."""
+"""A fork after kernels have run computes the same, on one thread, and waits for compilations and imports of others."""
 
 import multiprocessing
 import os
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from tests.recon.few_views import VIEWS
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 
+loading = threading.Event()  # a library of a test is being imported
 _METHODS = (recon.Fbp(), recon.Sirt(iterations=2))
 
 
@@ -77,5 +81,21 @@ def test_a_fork_waits_for_a_compilation_in_another_thread(noisy: F32) -> None:
         child = os.fork()
     if child == 0:
         os._exit(0 if goes_on.is_set() and global_compiler_lock._lock.acquire(timeout=5) else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    thread.join()
+
+
+def test_a_fork_waits_for_an_import_in_another_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "slow_library.py").write_text(
+        f"import time\nfrom {__name__} import loading\nloading.set()\ntime.sleep(0.3)\nend = 1"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    thread = threading.Thread(target=import_module, args=("slow_library",))
+    thread.start()
+    loading.wait()
+    with forks():
+        child = os.fork()
+    if child == 0:
+        os._exit(0 if hasattr(sys.modules["slow_library"], "end") else 1)
     assert os.waitpid(child, 0)[1] == 0
     thread.join()

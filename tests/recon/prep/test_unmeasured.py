@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 from recon.base.arrays import Mask
 from recon.prep.correct import Correction, CorrectionSettings, References
-from recon.prep.unmeasured import foreign_rows, runs_of, unmeasured, with_borders_filled
+from recon.prep.unmeasured import foreign_rows, runs_of, unmeasured, with_borders_filled, with_rim
 
 SHAPE, VIEWS = (20, 64), 32
 ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
@@ -31,15 +32,29 @@ def disc(radius: float, density: float, away: float = 0.0) -> np.ndarray:
 SAMPLE = disc(22, 0.03)
 
 
-@pytest.mark.parametrize(("width", "found"), [(1, 3), (9, 11), (21, 23)])
-def test_a_border_of_one_value_is_found_with_its_blurred_rim(width: int, found: int) -> None:
-    counts = np.random.default_rng(0).poisson(1e4, SHAPE) + 100
+@pytest.mark.parametrize("width", [1, 9, 21])
+@pytest.mark.parametrize(("shift", "rim"), [(0.0, 0), (0.4, 1)])
+def test_a_border_of_one_value_is_found_with_what_interpolation_mixed(width: int, shift: float, rim: int) -> None:
+    counts = np.random.default_rng(0).poisson(1e4, SHAPE) + 100.0
     counts[:, :width] = 0
+    counts[:, width] *= 1 - shift  # a pixel between both
     light = ((counts - 100) / 1e4).astype(np.float32)
     mask = unmeasured(counts, light, NOTHING, None)
-    assert mask is not None and mask[:, :found].all() and not mask[:, found:].any()
-    assert runs_of(mask, 7).tolist() == [[7, row, 0, found] for row in range(SHAPE[0])]
-    assert with_borders_filled(counts)[:, :width].min() > 9000
+    assert mask is not None and mask[:, : width + rim].all() and not mask[:, width + rim :].any()
+    assert runs_of(mask, 7).tolist() == [[7, row, 0, width + rim] for row in range(SHAPE[0])]
+    assert with_borders_filled(counts)[:, :width].min() > 5000
+
+
+@pytest.mark.parametrize("photons", [100.0, 1e4])
+@pytest.mark.parametrize(("blur", "rim"), [(0.01, 0), (0.6, 1)])
+def test_a_rim_is_as_wide_as_the_blur_of_an_edge(photons: float, blur: float, rim: int) -> None:
+    """Rows of a sample that changes from row to row, some of them not read."""
+    depth = 0.5 + 0.03 * np.arange(SHAPE[0])[:, None] + SAMPLE[:1]
+    light = np.exp(-depth) * (np.abs(np.arange(SHAPE[0]) - 9) > 2)[:, None]
+    light = np.random.default_rng(0).poisson(photons * gaussian_filter1d(light, blur, axis=0)) / photons
+    away = np.abs(np.arange(SHAPE[0]) - 9)
+    dark, expected = (np.repeat(away[:, None] <= reach, SHAPE[1], axis=1) for reach in (2, 2 + rim))
+    np.testing.assert_array_equal(with_rim(dark, light.astype(np.float32)), expected)
 
 
 def test_a_turn_of_the_image_leaves_corners() -> None:

@@ -17,7 +17,7 @@ from scipy import sparse
 from recon.base.geometry import Geometry
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid, Volume
-from recon.voxels.projector import Projector, project
+from recon.voxels.projector import Projector, measured_share, project
 from tests.recon.helpers import assert_transpose
 from tests.recon.kernels.voxels_reference import system_matrix
 
@@ -279,3 +279,15 @@ def test_it_reads_as_a_matrix() -> None:
     y = np.random.default_rng(1).random(a.projection_shape, dtype=np.float32)
 
     assert float((a(x) * y).sum()) == pytest.approx(float((x * a.T(y)).sum()), rel=1e-5)
+
+
+def test_the_share_of_known_rows_is_1_0_or_between_by_what_a_voxel_s_rays_meet() -> None:
+    known = np.ones(20, np.bool_)
+    known[4:9] = False
+    beam = Geometry.parallel(np.pi * np.arange(40) / 40, (20, 24))
+    np.testing.assert_allclose(measured_share(known, beam, Grid.matching(beam))[:, 12, 12], known, atol=1e-6)
+    cone = Geometry.cone(2 * np.pi * np.arange(40) / 40, (20, 24), 1.0, 50.0, 100.0)
+    share = measured_share(known, cone, Grid.matching(cone))
+    assert (share[5:8, 12, 12] == 0).any() and (share[12:] == 1).all()
+    off = share[:, 12, 2]  # beside the axis a voxel is now nearer to the source, now farther away
+    assert ((off > 0.1) & (off < 0.9)).any()

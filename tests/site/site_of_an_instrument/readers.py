@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from drivers.base.frame import FrameKind
 
@@ -20,8 +21,7 @@ class NpyStack(ScanSource):
     def __init__(self, path: Path) -> None:
         self.path, self._data = path, np.load(path, allow_pickle=False)
         self.shape, self.dtype, self.facts = self._data.shape[1:], self._data.dtype, {}
-        self.image_key = np.full(len(self._data), FrameKind.PROJECTION, np.int32)
-        self.angles = self.exposures = np.full(len(self._data), np.nan)
+        self.table = FrameTable.of(np.full(len(self._data), FrameKind.PROJECTION))
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         return self._data[frame_indices(frames, len(self._data)), rows]

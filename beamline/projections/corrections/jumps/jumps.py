@@ -16,7 +16,6 @@ from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
 from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
 from beamline.projections.step import StepDone, StepMemory, option
 from beamline.projections.usable_views import UsableViews, usable_views
-from drivers.base.frame import FrameKind
 from recon.base.volume import Grid
 
 if TYPE_CHECKING:
@@ -190,7 +189,7 @@ class _CoarseViews:
         for cols, rounds in _LEVELS:
             band = self.band(cols)
             views = ScanCorrection(self.source, band, lambda _: None).at_once(frames[looked])
-            geometry = geometry_of(self.source, band, self.axis_col, self.source.angles[views.view_ids])
+            geometry = geometry_of(self.source, band, self.axis_col, self.source.table.angles[views.view_ids])
             group = part[np.searchsorted(frames, views.view_ids)]
             seen = views.data, geometry, group, ~areas(views.masked)
             moves = displacements(*seen, moves, rounds)
@@ -222,7 +221,7 @@ def _search_memory(source: ScanSource, selection: Selection) -> int:
     if cone_of(source, selection) is not None or not (asked.judged or jumps.size):
         return 0
     coarse = _CoarseViews(source, selection, (source.shape[1] - 1) / 2)
-    n = min(int((source.image_key == FrameKind.PROJECTION).sum()), _VIEWS + 2 * _SHORT)
+    n = min(source.table.views.size, _VIEWS + 2 * _SHORT)
     band = coarse.band(_LEVELS[-1][0])
     views = geometry_of(source, band, coarse.axis_col, np.linspace(0, math.pi, n, endpoint=False))
     copy = 4 * n * math.prod(views.detector_shape)

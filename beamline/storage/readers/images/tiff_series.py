@@ -16,6 +16,7 @@ import re
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,8 +28,9 @@ from beamline.core.errors import DataError
 from beamline.core.files import TEXT, decoded, is_below, text_in
 from beamline.core.text import count, size, spans
 from beamline.storage import hdf5
+from beamline.storage.array_file import zarr_root
 from beamline.storage.datasets import require_real
-from beamline.storage.foreign_zarr import zarr_root
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.packing import packing
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, ScanSource, frame_indices
@@ -58,7 +60,7 @@ LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
 _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
-_SCALES = "scaleoffset.json"
+_SCALES, _PICTURE = "scaleoffset.json", ".png"
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$|(?:^|/)(angles?|thetas?)\.npy$")
 
 
@@ -82,9 +84,8 @@ class TiffSeriesSource(ScanSource):
             if not among:
                 raise DataError(no_image(path, names))
             images = in_order(path, among, one_series=one_series or listed is not None)
-            self.names, self.image_key, self.angles = images.names, images.kinds, images.angles
-            self.in_order, self.numbers = len(images.series) == len(images.names), images.numbers
-            self.exposures = np.full(len(self.names), np.nan)
+            self.names, self.in_order = images.names, len(images.series) == len(images.names)
+            self.table = FrameTable.of(images.kinds, images.angles, numbers=images.numbers)
             references, series = images.references, images.series
             with suppress(UnreadableError, *UNREADABLE), self._tiff(series[0]) as tif:  # damage is told below
                 refuse_volume(path, tif)
@@ -100,7 +101,7 @@ class TiffSeriesSource(ScanSource):
         if images.half_turn:
             self.not_used += (NotUsed(images.half_turn[0], count(len(images.half_turn), "image"), _BESIDE, False),)
         self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
-        if np.isfinite(self.angles).any() and len(self._texts) != 1:
+        if np.isfinite(self.table.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
         if images.doubt:
             self.facts |= {"angles": images.doubt}
@@ -111,7 +112,7 @@ class TiffSeriesSource(ScanSource):
         return (self._texts[0], self._text(self._texts[0])) if len(self._texts) == 1 else None
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        indices = frame_indices(frames, self.image_key.size)
+        indices = frame_indices(frames, len(self.table))
         out = np.empty((indices.size, len(range(self.shape[0])[rows]), self.shape[1]), self.dtype)
         for i, number in enumerate(indices):
             name = self.names[number]
@@ -276,7 +277,7 @@ def _open_scene(folder: Path) -> ScanSource:
         )
     source = TiffSeriesSource(folder, listed=[*angles])
     source.format, source.quantity = "r2_gaussian_scene", "line_integrals"
-    source.angles = np.array([angles[name] for name in source.names])
+    source.table = replace(source.table, angles=np.array([angles[name] for name in source.names]))
     source.cone = beams[mode]
     size, n = np.broadcast_to(scanner.get("sDetector", 0), 2), np.broadcast_to(scanner["nDetector"], 2)
     height, width = map(float, np.broadcast_to(scanner.get("dDetector", size / n), 2))
@@ -295,6 +296,8 @@ _BESIDE = "a view half a turn from the first, taken beside the series: the axis 
 
 
 def _open(path: Path, opening: Opening) -> ScanSource:
+    if path.suffix.lower() == _PICTURE and path.is_file():
+        return Frames(TiffSeriesSource(path.parent, listed=[path.name]), path=path)
     scene = _scene_of(path)
     return _with_values(TiffSeriesSource(path, one_series=opening.one_series)) if scene is None else _open_scene(scene)
 
@@ -317,7 +320,7 @@ FORMAT = ScanFormat(
     "a folder or .zip of images (TIFF, .npy or PNG), or a scene of R²-Gaussian",
     lambda path, opening: (
         (path.is_dir() and zarr_root(path) is None)
-        or (path.is_file() and path.suffix.lower() == ".zip" and zarr_root(path) is None)
+        or (path.is_file() and path.suffix.lower() in (".zip", _PICTURE) and zarr_root(path) is None)
         or _scene_of(path) is not None
     ),
     _open,

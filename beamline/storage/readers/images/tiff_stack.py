@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import hdf5
 from beamline.storage.datasets import require_real
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.side_files import offered
@@ -54,9 +55,7 @@ class TiffStackSource(ScanSource):
         if complaints.messages:
             self._tif.close()
             raise DataError(f"{path} cannot be read whole: it is cut or damaged ({complaints.messages[0]}).")
-        self.image_key = np.full(n, FrameKind.PROJECTION, np.int32)
-        self.angles = np.full(n, np.nan)
-        self.exposures = np.full(n, np.nan)
+        self.table = FrameTable.of(np.full(n, FrameKind.PROJECTION))
         self.facts = {"pages": len(self._tif.pages), "bigtiff": "yes" if self._tif.is_bigtiff else "no"}
         self.not_used += offered(self)
 
@@ -66,7 +65,7 @@ class TiffStackSource(ScanSource):
         refuse_packed(self._tif)
         require_possible(self._tif)
         series, *others = parts = images_of(self._tif)
-        if len(series.shape) not in (2, 3) or others:
+        if len(series.shape) not in (2, 3) or others or "S" in series.axes:  # samples of a colour
             shapes = ", ".join(f"{part.shape} along {part.axes}" for part in parts[:6])
             shapes += f", ... ({len(parts)} in all)" if len(parts) > 6 else ""
             raise DataError(f"{self.path} holds {shapes}; expected one stack of grey images [page, row, col].")
@@ -79,7 +78,7 @@ class TiffStackSource(ScanSource):
         return 1 if len(series.shape) == 2 else int(series.shape[0])
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-        indices = frame_indices(frames, self.image_key.size)
+        indices = frame_indices(frames, len(self.table))
         wanted = range(self.shape[0])[rows]
         out = np.empty((indices.size, len(wanted), self.shape[1]), self.dtype)
         for i, page in enumerate(indices):

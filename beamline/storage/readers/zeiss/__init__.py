@@ -8,6 +8,7 @@ dark, which the instrument has subtracted. Images are as they are stored.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -138,15 +139,15 @@ def _source(path: Path, file: TxrmFile, own_angles: bool) -> StacksSource:
         ]
     source = StacksSource(path, file, stacks, format="txrm", facts=_facts(file))
     if (shifts := _shifts(path, file, n)).any():
-        source.stated_shifts = np.full((source.image_key.size, 2), np.nan)
-        source.stated_shifts[-n:] = shifts
+        before = len(source.table) - n
+        source.table = replace(source.table, shifts=np.pad(shifts, ((before, 0), (0, 0)), constant_values=np.nan))
     if n < planned:
         source.stated_ending = ScanEnding("stopped", reason=f"{n} of {count(planned, 'planned view')} were taken.")
     angles = file.numbers("ImageInfo/Angles", "<f4", n)
     if own_angles:
         if angles is None:
             raise DataError(f"{path} does not say the angles of its {n} views: give --angles FILE (degrees).")
-        source.angles[-n:] = np.radians(angles.astype(np.float64))
+        source.table.angles[-n:] = np.radians(angles.astype(np.float64))
     _set_exposures(source, file, n)
     _set_scale(source, file)
     return source
@@ -177,11 +178,11 @@ def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
 def _set_exposures(source: StacksSource, file: TxrmFile, n: int) -> None:
     """Seconds of the views and of the reference, which may have its own."""
     views = file.numbers("ImageInfo/ExpTimes", "<f4", n)
-    source.exposures[-n:] = np.nan if views is None else np.where(views > 0, views, np.nan)
+    source.table.exposures[-n:] = np.nan if views is None else np.where(views > 0, views, np.nan)
     for name in ("ReferenceData/ImageInfo/ExpTimes", "ReferenceData/ImageInfo/ExpTime", "ReferenceData/ExpTime"):
         seconds = file.numbers(name, "<f4")
         if seconds is not None and seconds[0] > 0:
-            source.exposures[source.image_key == FrameKind.FLAT] = seconds[0]
+            source.table.exposures[source.table.flats] = seconds[0]
             break
 
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.events import json_of
 from beamline.core.files import SETTINGS, bytes_below
-from beamline.storage.foreign_zarr import open_zarr, zarr_library
+from beamline.storage.array_file import zarr_library
+from beamline.storage.foreign_zarr import open_zarr
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes import REGISTRY

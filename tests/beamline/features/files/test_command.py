@@ -117,7 +117,7 @@ def test_ingest_makes_a_scan_of_a_stack(folder: Path) -> None:
     with open_scan("out.h5") as source:
         assert source.quantity == "line_integrals"
         assert (source.pixel_size_mm, source.energy_kev, source.attributes["sample"]) == (0.5, 25.0, "cylinders")
-        np.testing.assert_allclose(source.angles, SCAN.angles)
+        np.testing.assert_allclose(source.table.angles, SCAN.angles)
         np.testing.assert_array_equal(source.read([0, 17]), SCAN.line_integrals().astype(np.float32)[[0, 17]])
 
 

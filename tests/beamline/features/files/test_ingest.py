@@ -56,7 +56,7 @@ def test_a_float_stack_keeps_its_pixels_and_gets_statistics(stack: tuple[Path, n
         assert (source.format, source.dtype, source.quantity) == ("float_projections", np.float32, "line_integrals")
         assert (source.pixel_size_mm, source.attributes["no_data"]) == (0.01, -999.0)
         np.testing.assert_array_equal(source.read(slice(None)), pages)
-        np.testing.assert_allclose(source.angles, ANGLES, rtol=1e-15)
+        np.testing.assert_allclose(source.table.angles, ANGLES, rtol=1e-15)
     with h5py.File(tmp_path / "out.h5") as file:
         for i, page in enumerate(pages):
             expected = digest(page, no_data=-999)
@@ -79,7 +79,7 @@ def test_an_integer_stack_becomes_a_valid_nxtomo(tmp_path: Path, rng: np.random.
     )
     assert done.definition == "NXtomo"
     with open_scan(tmp_path / "out.h5") as source:
-        assert source.image_key.tolist() == [2, 1, 1, *[0] * N]
+        assert source.table.kinds.tolist() == [2, 1, 1, *[0] * N]
         assert (source.quantity, source.attributes["sample"]) == ("counts", "rock")
         np.testing.assert_array_equal(source.read(slice(3, None)), pages)
     told = {finding.rule for finding in validate(tmp_path / "out.h5")}
@@ -142,7 +142,7 @@ def test_kinds_and_order_come_through(tmp_path: Path) -> None:
     ingest(SourceOptions(tmp_path / "scan", angles=[0.0, 1.0]), tmp_path / "out.h5")
     with open_scan(tmp_path / "out.h5") as source:
         assert source.read(slice(None))[:, 0, 0].tolist() == [10, 900, 502, 510]
-        assert source.image_key.tolist() == [FrameKind.DARK, FrameKind.FLAT, 0, 0]
+        assert source.table.kinds.tolist() == [FrameKind.DARK, FrameKind.FLAT, 0, 0]
 
 
 COPIED: dict[str, list[tuple[str, Any, str | None]]] = {

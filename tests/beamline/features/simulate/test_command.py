@@ -64,8 +64,8 @@ def test_a_simulated_scan_is_a_scan(folder: Path) -> None:
     assert read_labels(Path("scan.labels.json")) == ()
     with open_scan("scan.h5") as source:
         kinds = [FrameKind.DARK] * 2 + [FrameKind.FLAT] * 2 + [FrameKind.PROJECTION] * 6
-        assert source.image_key.tolist() == kinds
-        np.testing.assert_allclose(np.degrees(source.angles[4:]), np.arange(6) * 30.0)
+        assert source.table.kinds.tolist() == kinds
+        np.testing.assert_allclose(np.degrees(source.table.angles[4:]), np.arange(6) * 30.0)
         assert source.axis_col == 19.5 + 1.5
         assert source.pixel_size_mm == pytest.approx(0.012)
         frames = source.read(slice(None)).astype(float)
@@ -124,7 +124,7 @@ def test_interrupted_the_file_holds_what_was_made(folder: Path, monkeypatch: pyt
     assert "Stopping after this frame. Ctrl-C again stops at once." in result.stderr
     assert "Stopped after 7 of 16 frames; scan.h5 holds them and is readable." in result.stderr
     with open_scan("scan.h5") as source:
-        assert source.image_key.size == 7
+        assert len(source.table) == 7
         assert source.attributes["status"] == "stopped"
     assert json.loads(Path("scan.labels.json").read_text(encoding="utf-8"))["frames"] == 7
 
@@ -149,7 +149,7 @@ def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
     events = [json.loads(line)["event"] for line in result.stdout.splitlines()]
     assert (events[-1], events.count("failed"), "done" in events) == ("failed", 1, False)
     with open_scan("scan.h5") as source:
-        assert (source.image_key.size, source.attributes["status"]) == (6, "failed")
+        assert (len(source.table), source.attributes["status"]) == (6, "failed")
     (run,) = read_labels(Path("scan.labels.json"))
     assert (run.kind, run.first, run.last) == ("black_band", 2, 5)
 
@@ -229,7 +229,7 @@ def test_a_simulated_file_says_what_its_frames_show(tmp_path: Path, effects: lis
     scan = Scan.of(scene.scene)
     write_scan(scene, scan, tmp_path / "scan.h5", lambda _: None, VirtualClock(), lambda: False)
     with open_scan(tmp_path / "scan.h5") as source:
-        geometry = geometry_of(source, Selection(), 7.5, source.angles[2:])
+        geometry = geometry_of(source, Selection(), 7.5, source.table.angles[2:])
         seen, done = Width(arc="auto").rays(source, Selection(), geometry)
         assert source.row_period == pytest.approx(scan.frame(0).shot.row_period if effects else 0)
     moved = math.radians(180) / 6 / scan.period * 0.012

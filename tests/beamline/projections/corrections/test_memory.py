@@ -57,8 +57,8 @@ def peak(work: Callable[[], object]) -> int:
 
 
 def part_of(source: ScanSource, *steps: PrepStep) -> ScanPart:
-    selection, views = Selection(steps=steps), source.image_key == 0
-    return ScanPart(source, selection, geometry_of(source, selection, source.shape[1] / 2, source.angles[views]))
+    selection, views = Selection(steps=steps), source.table.kinds == 0
+    return ScanPart(source, selection, geometry_of(source, selection, source.shape[1] / 2, source.table.angles[views]))
 
 
 def needs(path: Path, *steps: PrepStep) -> ReconMemory:

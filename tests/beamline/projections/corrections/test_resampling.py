@@ -98,11 +98,11 @@ def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion
     plain = Air("none"), Preparation(zinger_threshold=1e9)  # zingers are judged by the rows that are there
     selection = Selection(binning=binning, steps=(*plain, TiltAndLens(1.5, lens)))
     source, frames = _source(1.5), np.arange(2, 30)
-    correction = ScanCorrection(source, selection, pytest.fail)  # type: ignore[arg-type]
+    correction = ScanCorrection(source, selection, pytest.fail)
     whole = correction.at_once(frames).data
     np.testing.assert_array_equal(correction.at_once(frames, slice(9, 12)).data, whole[:, 9:12])
     rows = replace(selection, rows=(8 * binning, 14 * binning))
-    band = ScanCorrection(source, rows, pytest.fail).at_once(frames).data  # type: ignore[arg-type]
+    band = ScanCorrection(source, rows, pytest.fail).at_once(frames).data
     np.testing.assert_array_equal(band, whole[:, 8:14])
     out = np.empty(whole.shape, np.float32)
     np.testing.assert_array_equal(correction.in_batches(frames, out, 9, lambda *_: None).data, whole)
@@ -114,6 +114,6 @@ def test_what_cannot_be_levelled_is_refused() -> None:
         prepare(source, replace(SELECTION, cone=(100.0, 200.0), pixel_size_mm=0.1).with_steps(TiltAndLens(1.0)))
     with pytest.raises(ConfigError, match="--tilt and --distortion"):
         prepare(source, SELECTION.with_steps(TiltAndLens(1.0), Preparation(noise="counts")))
-    few = ArraySource(source._data[:22], source.image_key[:22].tolist(), source.angles[:22])
+    few = ArraySource(source._data[:22], source.table.kinds[:22].tolist(), source.table.angles[:22])
     with pytest.raises(DataError, match="was not found"):
         prepare(few, replace(SELECTION, axis_col=49.3).with_steps(TiltAndLens("auto")))

@@ -27,7 +27,7 @@ def _source(mode: str = "fly", sense: float = 1.0, row_period: float | None = RO
     angles = np.r_[np.nan, np.nan, sense * STEP * np.arange(90)]
     angles[50] = np.nan  # of a view without an angle
     source: Any = ArraySource(np.zeros((92, *SHAPE), np.uint16), keys, angles, np.r_[1.0, 1.0, np.full(90, exposure)])
-    source.plan, source.attributes, source.row_period = {"mode": mode}, {"period_s": PERIOD}, row_period
+    source.plan, source.facts, source.row_period = {"mode": mode}, {"period_s": PERIOD}, row_period
     return source
 
 
@@ -39,7 +39,7 @@ def _rays(step: Width, source: Any, selection: Selection | None = None) -> tuple
 
 def test_nothing_is_changed_by_default_where_the_stage_stood() -> None:
     unknown = _source()
-    unknown.exposures[:] = np.nan
+    unknown.table.exposures[:] = np.nan
     for source in (_source("step"), unknown):
         before, after, done = _rays(Width(), source)
         assert after is before and (done.sentence, done.parameters) == ("", {})
@@ -121,7 +121,7 @@ def test_a_followed_scan_sees_the_middle_of_the_exposure_too() -> None:
     source, ids = _source(), np.arange(2, 40)
     views = FollowedViews(source, Selection())
     turned = ARC / 2 + SKEW * (SHAPE[0] - 1) / 2
-    np.testing.assert_allclose(views.angles(100.0, ids), source.angles[ids] + turned)
+    np.testing.assert_allclose(views.angles(100.0, ids), source.table.angles[ids] + turned)
     geometry, done = views.geometry(100.0, ids)
     assert (geometry.width.arc, geometry.skew) == (pytest.approx(ARC), pytest.approx(SKEW))
     assert (done.parameters or {})["exposure_arc_deg"] == pytest.approx(1.6)

@@ -37,9 +37,9 @@ def test_pixels_are_those_of_the_columns(path: Path) -> None:
 
 def test_everything_else_is_as_in_the_whole_scan(path: Path) -> None:
     with open_scan(path) as whole, open_scan(SourceOptions(path, cols=(1, 4))) as part:
-        for name in ("image_key", "angles", "exposures", "part_starts", "replaces", "currents"):
-            np.testing.assert_array_equal(getattr(part, name), getattr(whole, name))
-        for name in ("quantity", "finished", "altered", "damaged", "plan", "attributes", "checksummed", "cone"):
+        for name, column in vars(whole.table).items():
+            np.testing.assert_array_equal(getattr(part.table, name), column)
+        for name in ("quantity", "finished", "damaged", "plan", "attributes", "checksummed", "cone"):
             assert getattr(part, name) == getattr(whole, name)
         assert part.refresh() == whole.refresh()
 
@@ -54,16 +54,16 @@ class _Flagged(ArraySource):
         regions = np.full((3, len(TODAY), 4), -1, np.int32)
         regions[1, 0] = 2, 6, 60, 70
         bits = np.array([0, 1 << TODAY[0].bit, 0], np.uint64)
-        self.flags = FrameFlags(bits, TODAY, np.zeros((3, len(TODAY)), np.float32), regions)
+        self.state(flags=FrameFlags(bits, TODAY, np.zeros((3, len(TODAY)), np.float32), regions))
 
 
 @pytest.mark.parametrize(("cols", "left", "right"), [((40, 100), 19, 31), ((0, 65), 59, 65), ((0, 50), 59, 59)])
 def test_regions_of_flags_move_with_the_columns(cols: tuple[int, int], left: int, right: int) -> None:
     from beamline.projections.usable_views import regions_of
 
-    source: Any = cropped(_Flagged(), cols)  # type: ignore[arg-type]
+    source: Any = cropped(_Flagged(), cols)
     assert source.axis_col == 52.5 - cols[0]
-    treated = treatment_of(source.flags, np.ones(3, np.bool_), source.shape)
+    treated = treatment_of(source.table.flags, np.ones(3, np.bool_), source.shape)
     (box,) = regions_of(treated.flags, source.shape).boxes
     assert box[2:].tolist() == [left, right] and treated.masked.tolist() == [False, True, False]
 
@@ -72,7 +72,7 @@ def test_the_lens_keeps_its_centre() -> None:
     lens = Distortion(48.0, 5.0, (1.0, 0.0, 1e-4))
     places = []
     for cols in ((0, 100), (30, 90)):
-        source: Any = cropped(_Flagged(), cols)  # type: ignore[arg-type]
+        source: Any = cropped(_Flagged(), cols)
         found = TiltAndLens(distortion=lens).of(source, Selection())
         assert found is not None
         places.append(found.places(source.shape, 0)[1] + cols[0])

@@ -40,16 +40,28 @@ def store(path: Path, parts: Parts, units: str | None = "deg") -> Path:
 def test_darks_then_flats_then_projections(tmp_path: Path, parts: Parts) -> None:
     with open_scan(store(tmp_path / "s.h5", parts)) as source:
         assert (source.format, source.quantity, source.finished) == ("data_exchange", "counts", True)
-        assert source.image_key.tolist() == [2, 2, 1, 1, 1, 0, 0, 0, 0, 0]
+        assert source.table.kinds.tolist() == [2, 2, 1, 1, 1, 0, 0, 0, 0, 0]
         whole = np.concatenate([parts["data_dark"], parts["data_white"], parts["data"]])
         np.testing.assert_array_equal(source.read(slice(None)), whole)
         np.testing.assert_array_equal(source.read([9, 0, 4, 5, 2], slice(1, 3)), whole[[9, 0, 4, 5, 2], 1:3])
-        np.testing.assert_allclose(source.angles[5:], np.linspace(0, np.pi, 5))
-        assert np.isnan(source.angles[:5]).all()
+        np.testing.assert_allclose(source.table.angles[5:], np.linspace(0, np.pi, 5))
+        assert np.isnan(source.table.angles[:5]).all()
         replayed = list(source.frames())
     assert [frame.trigger for frame in replayed] == [0, 1, 0, 1, 2, 0, 1, 2, 3, 4]
     assert [frame.kind for frame in replayed[:3]] == [FrameKind.DARK, FrameKind.DARK, FrameKind.FLAT]
     np.testing.assert_array_equal(replayed[7].counts, parts["data"][2])
+
+
+def test_frames_named_by_their_path_are_the_same_scan(tmp_path: Path, parts: Parts) -> None:
+    """With its darks, flats and degrees; where some of them are named, only these."""
+    path = store(tmp_path / "s.h5", parts, None)
+    named = {"data_path": "/exchange/data", "angles_path": "/exchange/theta"}
+    with open_scan(SourceOptions(path, **named)) as source:  # type: ignore[arg-type]
+        assert source.table.kinds.tolist() == [2, 2, 1, 1, 1, 0, 0, 0, 0, 0]
+        np.testing.assert_allclose(source.table.angles[5:], np.linspace(0, np.pi, 5))
+    flats = SourceOptions(path, data_path="exchange/data", flats_path="exchange/data_white", angles=np.arange(5.0))
+    with open_scan(flats) as source:
+        assert source.table.kinds.tolist() == [1, 1, 1, 0, 0, 0, 0, 0]
 
 
 def test_float_references_keep_their_fractions(tmp_path: Path, parts: Parts) -> None:
@@ -68,7 +80,7 @@ def test_theta_is_in_degrees_unless_it_says_radians(
     tmp_path: Path, parts: Parts, units: str | None, factor: float
 ) -> None:
     with open_scan(store(tmp_path / "s.h5", parts, units)) as source:
-        np.testing.assert_allclose(source.angles[5:], parts["theta"] * factor)
+        np.testing.assert_allclose(source.table.angles[5:], parts["theta"] * factor)
     with pytest.raises(DataError, match="units 'mm'"):
         open_scan(store(tmp_path / "s.h5", parts, "mm"))
 
@@ -106,7 +118,7 @@ def test_what_does_not_fit_is_refused(
 @pytest.mark.parametrize("shape", [(5, 1), (1, 5)])
 def test_a_column_of_angles_is_a_list_of_them(tmp_path: Path, parts: Parts, shape: tuple[int, int]) -> None:
     with open_scan(store(tmp_path / "s.h5", parts | {"theta": parts["theta"].reshape(shape)})) as source:
-        np.testing.assert_allclose(source.angles[5:], np.linspace(0, np.pi, 5))
+        np.testing.assert_allclose(source.table.angles[5:], np.linspace(0, np.pi, 5))
 
 
 def test_our_own_exchange_view_reads_like_the_scan(path: Path, frames: list[Frame], tmp_path: Path) -> None:
@@ -115,18 +127,18 @@ def test_our_own_exchange_view_reads_like_the_scan(path: Path, frames: list[Fram
         for name in file["exchange"]:
             other[f"exchange/{name}"] = file["exchange"][name][()]
         other["exchange/theta"].attrs["units"] = "deg"
-        expected, angles = native.read(slice(None)), native.angles
+        expected, angles = native.read(slice(None)), native.table.angles
     with open_scan(tmp_path / "only_dx.h5") as source:
         np.testing.assert_array_equal(source.read(slice(None)), expected)
-        np.testing.assert_allclose(source.angles, angles)
+        np.testing.assert_allclose(source.table.angles, angles)
 
 
 def test_real_files(shared_data: Path) -> None:
     with open_scan(shared_data / "diamond_24737_parallel_91x135x160.h5") as source:
         assert (source.shape, source.quantity, source.dtype) == ((135, 160), "counts", np.float32)
-        np.testing.assert_allclose(np.degrees(source.angles[[2, -1]]), [-88.2, 91.8], atol=1e-3)
+        np.testing.assert_allclose(np.degrees(source.table.angles[[2, -1]]), [-88.2, 91.8], atol=1e-3)
     with open_scan(shared_data / "aps2bm_tooth_181x2x640.h5") as source:
-        assert np.bincount(source.image_key).tolist() == [181, 10, 10]
+        assert np.bincount(source.table.kinds).tolist() == [181, 10, 10]
         assert source.attributes["sample"] == "Tooth"
     with open_scan(shared_data / "walnut_parallel_rebinned_240x96x256.h5") as source:
         assert source.quantity == "unknown"
@@ -150,9 +162,9 @@ def test_flats_of_both_ends_with_their_angles_stand_around_the_views(
     frames = {"data": np.full((8, 2, 3), 50), "data_white": np.arange(100, 124).reshape(4, 2, 3)}
     parts = frames | {"data_dark": np.zeros((2, 2, 3)), "theta": said(theta), "theta_white": said(white)}
     with open_scan(store(tmp_path / "s.h5", {k: v.astype(float) for k, v in parts.items()}, unit)) as source:
-        assert source.image_key.tolist() == [2, 2, 1, 1, *[0] * 8, 1, 1] and not source.in_order
+        assert source.table.kinds.tolist() == [2, 2, 1, 1, *[0] * 8, 1, 1] and not source.in_order
         np.testing.assert_array_equal(source.read([2, 3, 12, 13]), frames["data_white"])
-        np.testing.assert_allclose(np.degrees(source.angles[4:12]), theta)
+        np.testing.assert_allclose(np.degrees(source.table.angles[4:12]), theta)
 
 
 @pytest.mark.parametrize(

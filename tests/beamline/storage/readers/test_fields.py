@@ -11,7 +11,10 @@ import h5py
 import numpy as np
 import pytest
 
+from beamline.core.errors import DataError
 from beamline.features.files.validate import describe, validate
+from beamline.projections.selection import Selection
+from beamline.projections.views import checked_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.fields import EXCHANGE, NXTOMO, Entry
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -80,17 +83,21 @@ WAVELENGTH = 12.39841984 / 25
 USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource], object], Any]] = {
     "definition": ([("definition", "NXtomo", None)], lambda s: s.format, "nxtomo"),
     "detector/data": ([], lambda s: s.shape, (ROWS, COLS)),
-    "detector/image_key": ([], lambda s: s.image_key.tolist(), KEY.tolist()),
+    "detector/image_key": ([], lambda s: s.table.kinds.tolist(), KEY.tolist()),
     "detector/image_key_control": (
-        [("detector/image_key_control", np.r_[2, 1, -1, [0] * 4], None)], lambda s: s.image_key[2], -1,
+        [("detector/image_key_control", np.r_[2, 1, -1, [0] * 4], None)], lambda s: s.table.kinds[2], -1,
     ),
-    "detector/count_time": ([("detector/count_time", np.full(7, 20.0), "ms")], lambda s: s.exposures[0], 0.02),
+    "detector/count_time": ([("detector/count_time", np.full(7, 20.0), "ms")], lambda s: s.table.exposures[0], 0.02),
     **{f"{of}/x_pixel_size": ([(f"{of}/x_pixel_size", 2.0, "um")], lambda s: s.pixel_size_mm, 2e-3) for of in PLACES},
     **{f"{of}/y_pixel_size": ([(f"{of}/y_pixel_size", 2.0, "um")], lambda s: s.row_pitch_mm, 2e-3) for of in PLACES},
     "detector/distance": ([("detector/distance", 0.2, "m")], lambda s: s.attributes["distance_mm"], 200),
     "instrument/source/distance": (list(CONE), lambda s: s.cone, (10, 20)),
-    "sample/rotation_angle": ([], lambda s: np.degrees(s.angles[-1]), 144),
-    "sample/depends_on": ([("sample/depends_on", "rotation_angle", None)], lambda s: np.degrees(s.angles[-1]), 144),
+    "sample/rotation_angle": ([], lambda s: np.degrees(s.table.angles[-1]), 144),
+    "sample/depends_on": (
+        [("sample/depends_on", "rotation_angle", None)],
+        lambda s: np.degrees(s.table.angles[-1]),
+        144,
+    ),
     **{
         where: ([(where, "said", None)], partial(lambda name, s: s.attributes[name], name), "said")
         for where, name in (
@@ -98,7 +105,7 @@ USED_NX: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource
             ("instrument/name", "instrument"),
         )
     },
-    "control/data": ([("control/data", np.arange(1.0, 8), None)], lambda s: np.asarray(s.currents).tolist()[6], 7),
+    "control/data": ([("control/data", np.arange(1.0, 8), None)], lambda s: np.asarray(s.table.currents)[6], 7),
     **{
         f"{where}/incident_energy": ([(f"{where}/incident_energy", 25e3, "eV")], lambda s: s.energy_kev, 25)
         for where in ("instrument/beam", "beam", "sample/beam")
@@ -130,9 +137,9 @@ PIXEL = "measurement/instrument/detector"
 USED_EXCHANGE: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[ScanSource], object], Any]] = {
     "implements": ([], lambda s: s.format, "data_exchange"),
     "exchange/data": ([], lambda s: s.shape, (ROWS, COLS)),
-    "exchange/data_white": ([], lambda s: int((s.image_key == 1).sum()), 1),
-    "exchange/data_dark": ([], lambda s: int((s.image_key == 2).sum()), 1),
-    "exchange/theta": ([], lambda s: np.degrees(s.angles[-1]), 144),
+    "exchange/data_white": ([], lambda s: int((s.table.kinds == 1).sum()), 1),
+    "exchange/data_dark": ([], lambda s: int((s.table.kinds == 2).sum()), 1),
+    "exchange/theta": ([], lambda s: np.degrees(s.table.angles[-1]), 144),
     "exchange/title": ([("exchange/title", "a tooth", None)], lambda s: s.attributes["title"], "a tooth"),
     SAMPLE: ([(SAMPLE, "tooth", None)], lambda s: s.attributes["sample"], "tooth"),
     ENERGY: ([(ENERGY, 25.0, "keV")], lambda s: s.energy_kev, 25),
@@ -153,39 +160,43 @@ USED_EXCHANGE: dict[str, tuple[list[tuple[str, Any, str | None]], Callable[[Scan
 FLAT_FIELDS = "process/acquisition/flat_fields"
 DIFFERENT = np.frombuffer(b"Different".ljust(40, b"\0"), np.uint8)[None]
 USED_EXCHANGE |= {
-    f"{PIXEL}/exposure_time": ([(f"{PIXEL}/exposure_time", [100.0], "ms")], lambda s: s.exposures.tolist(), [0.1] * 7),
+    f"{PIXEL}/exposure_time": (
+        [(f"{PIXEL}/exposure_time", [100.0], "ms")],
+        lambda s: s.table.exposures.tolist(),
+        [0.1] * 7,
+    ),
     f"{FLAT_FIELDS}/flat_exposure_time": (
         [
             (f"{PIXEL}/exposure_time", 0.1, "s"), (f"{FLAT_FIELDS}/flat_exposure_time", [0.05], None),
             (f"{FLAT_FIELDS}/different_flat_exposure", DIFFERENT, None),
         ],
-        lambda s: s.exposures[:3].tolist(), [0.1, 0.05, 0.1],
+        lambda s: s.table.exposures[:3].tolist(), [0.1, 0.05, 0.1],
     ),
     f"{FLAT_FIELDS}/different_flat_exposure": (
         [
             (f"{PIXEL}/exposure_time", 0.1, "s"), (f"{FLAT_FIELDS}/flat_exposure_time", [0.05], "s"),
             (f"{FLAT_FIELDS}/different_flat_exposure", "Same", None),
         ],
-        lambda s: s.exposures[:3].tolist(), [0.1, 0.1, 0.1],
+        lambda s: s.table.exposures[:3].tolist(), [0.1, 0.1, 0.1],
     ),
     f"{FLAT_FIELDS}/flat_field_mode": (
         [("exchange/data_white", FRAMES[:2], None), (f"{FLAT_FIELDS}/flat_field_mode", "Both", None)],
-        lambda s: s.image_key.tolist(), [2, 1, 0, 0, 0, 0, 0, 1],
+        lambda s: s.table.kinds.tolist(), [2, 1, 0, 0, 0, 0, 0, 1],
     ),
     f"{FLAT_FIELDS}/num_flat_fields": (
         [
             ("exchange/data_white", FRAMES[:2], None), (f"{FLAT_FIELDS}/flat_field_mode", "Both", None),
             (f"{FLAT_FIELDS}/num_flat_fields", 2, None),
         ],
-        lambda s: s.image_key.tolist(), [2, 1, 1, 0, 0, 0, 0, 0],
+        lambda s: s.table.kinds.tolist(), [2, 1, 1, 0, 0, 0, 0, 0],
     ),
     "exchange/theta_white": (
         [("exchange/theta_white", [72.0], "deg"), ("exchange/theta_dark", [0.0], "deg")],
-        lambda s: s.image_key.tolist(), [2, 0, 0, 1, 0, 0, 0],
+        lambda s: s.table.kinds.tolist(), [2, 0, 0, 1, 0, 0, 0],
     ),
     "exchange/theta_dark": (
         [("exchange/theta_white", [0.0], None), ("exchange/theta_dark", [144.0], None)],
-        lambda s: s.image_key.tolist(), [1, 0, 0, 0, 0, 0, 2],
+        lambda s: s.table.kinds.tolist(), [1, 0, 0, 0, 0, 0, 2],
     ),
 }  # fmt: skip
 TRIED = {"detector/transformations"}  # in test_nexus
@@ -291,9 +302,33 @@ def test_pixel_sizes_that_differ_from_view_to_view(tmp_path: Path, side: str, n:
         sizes = np.r_[[9.0] * (n - VIEWS), 6.5 * (1 + spread * np.linspace(-1, 1, VIEWS))]
         path = nxtomo(tmp_path / "s.nx", (f"detector/{side}_pixel_size", sizes, "um"))
         hits = [hit for hit in validate(path) if f"detector/{side}_pixel_size" in hit.message]
-        assert all(hit.severity == "warning" and "differs from view to view" in hit.message for hit in hits)
+        assert all(hit.severity == "error" and "differs from view to view" in hit.message for hit in hits)
         return [hit.message for hit in hits]
 
     assert not said(0.1)  # 0.3 of a pixel at the edge of six columns
     (message,) = said(0.2)
     assert "by up to 0.6 px" in message
+
+
+@pytest.mark.parametrize("option", [{}, {"pixel_size_mm": 0.0065}])
+def test_a_volume_of_sizes_that_differ_is_refused_unless_one_is_said(tmp_path: Path, option: dict[str, float]) -> None:
+    sizes = 6.5 * (1 + 0.2 * np.linspace(-1, 1, VIEWS))
+    refused = _refused(nxtomo(tmp_path / "s.nx", (f"{DETECTOR}/x_pixel_size", sizes, "um")), Selection(**option))  # type: ignore[arg-type]
+    assert ("differs from view to view" in refused) == (not option)
+
+
+@pytest.mark.parametrize("cone", [None, (10.0, 20.0)])
+def test_a_scan_is_judged_as_the_beam_that_is_said(tmp_path: Path, cone: tuple[float, float] | None) -> None:
+    """High pixels are slices apart in a parallel beam, and refused in a cone."""
+    refused = _refused(nxtomo(tmp_path / "s.nx", (f"{DETECTOR}/y_pixel_size", 2e-6, "m")), Selection(cone=cone))
+    assert ("in a cone beam" in refused) == (cone is not None)
+
+
+def _refused(path: Path, selection: Selection) -> str:
+    """Why `recon` refuses a scan; "" if it does not."""
+    with open_scan(path) as source:
+        try:
+            checked_views(source, selection, lambda sentence: None)
+        except DataError as error:
+            return str(error)
+    return ""

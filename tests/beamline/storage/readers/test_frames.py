@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,19 +19,22 @@ def _of(n: int, first: int = 0) -> Any:
 
 def test_rows_count_from_the_first_frame_of_all() -> None:
     one, other = _of(2), _of(3, 12)
-    one.damaged, other.damaged, other.altered = frozenset({1}), frozenset({0}), frozenset({2})
-    other.replaces, other.part_starts = np.array([-1, 0, -1]), np.array([0, 1])
+    one.damaged, other.damaged = frozenset({1}), frozenset({0})
     nothing = np.full((3, len(TODAY)), np.nan, np.float32), np.full((3, len(TODAY), 4), -1, np.int32)
-    other.flags = FrameFlags(np.array([0, 1 << TODAY[0].bit, 0], np.uint64), TODAY, *nothing)
-    one.pass_ends = np.array([2])
+    one.state(pass_ends=np.array([2]))
+    other.state(
+        replaces=np.array([-1, 0, -1]),
+        part_starts=np.array([0, 1]),
+        altered=np.array([False, False, True]),
+        pass_ends=np.array([1, 3]),
+        flags=FrameFlags(np.array([0, 1 << TODAY[0].bit, 0], np.uint64), TODAY, *nothing),
+    )
     both = Frames(one, other)
-    assert both.pass_ends.tolist() == [2]
-    other.pass_ends = np.array([1, 3])
-    assert both.pass_ends.tolist() == [2, 3, 5] and both.pass_ends.dtype == np.int64
-    assert (both.damaged, both.altered) == ({1, 2}, {4})
-    assert both.replaces is not None and both.replaces.tolist() == [-1, -1, -1, 2, -1]
-    assert both.part_starts.tolist() == [0, 2, 3]
-    assert both.flags is not None and both.flags.flagged.tolist() == [False] * 3 + [True, False]
+    assert both.table.pass_ends.tolist() == [2, 3, 5] and both.table.pass_ends.dtype == np.int64
+    assert (both.damaged, np.flatnonzero(both.table.altered).tolist()) == ({1, 2}, [4])
+    assert both.table.replaces is not None and both.table.replaces.tolist() == [-1, -1, -1, 2, -1]
+    assert both.table.part_starts.tolist() == [0, 2, 3]
+    assert both.table.flags is not None and both.table.flags.flagged.tolist() == [False] * 3 + [True, False]
     np.testing.assert_array_equal(both.read([4, 0, 3], slice(1, 2)).ravel(), [27, 28, 29, 3, 4, 5, 21, 22, 23])
 
 
@@ -41,12 +45,11 @@ def test_what_differs_is_a_value_or_follows_the_source() -> None:
         pixels=lambda read, frames, rows: read(frames, rows) + 1,
         axis_col=3.5,
         attributes={"from": "a test"},
-        image_key=lambda keys: np.where(np.arange(keys.size) == 1, 1, keys).astype(np.int32),
+        table=lambda known: replace(known, kinds=np.where(np.arange(len(known)) == 1, 1, known.kinds)),
     )
-    assert (changed.axis_col, changed.attributes, changed.image_key.tolist()) == (3.5, {"from": "a test"}, [0, 1])
+    assert (changed.axis_col, changed.attributes, changed.table.kinds.tolist()) == (3.5, {"from": "a test"}, [0, 1])
     grown = _of(4)
-    base.image_key, base.angles, base.exposures, base.read = grown.image_key, grown.angles, grown.exposures, grown.read
-    base.triggers, base.framestamps = grown.triggers, grown.framestamps
-    assert changed.image_key.size == 2 and changed.refresh() == 4
+    base.table, base.read = grown.table, grown.read
+    assert len(changed.table) == 2 and changed.refresh() == 4
     frame = next(changed.frames(3))
     assert (frame.index, frame.trigger, frame.framestamp, int(frame.counts[0, 0])) == (3, 3, 7, 19)

@@ -173,7 +173,7 @@ CHAINS: dict[str, tuple[Callable[[h5py.Group], None], int]] = {
 def test_the_rotation_that_a_sample_depends_on(tmp_path: Path, chain: str) -> None:
     add, sense = CHAINS[chain]
     path = nxtomo(tmp_path / "s.nx", also=add)
-    np.testing.assert_allclose(np.degrees(opened(path).angles), sense * TURN, atol=1e-12)
+    np.testing.assert_allclose(np.degrees(opened(path).table.angles), sense * TURN, atol=1e-12)
     warned = [hit.message for hit in validate(path) if hit.rule == "angles"]
     assert [f"--angles-path /entry0000/{T}/omega takes them" in message for message in warned] == [True] * (sense < 0)
 
@@ -192,4 +192,4 @@ def test_lists_that_may_be_angles_are_named(tmp_path: Path, add: Callable[[h5py.
     (error,) = [hit.message for hit in validate(path) if hit.severity == "error" and "no angle" in hit.message]
     assert f"/entry0000/{T}/omega" in error and "may be the angles: --angles-path " in error
     with open_scan(SourceOptions(path, angles_path=f"/entry0000/{T}/omega")) as source:
-        np.testing.assert_allclose(np.degrees(source.angles), TURN)
+        np.testing.assert_allclose(np.degrees(source.table.angles), TURN)

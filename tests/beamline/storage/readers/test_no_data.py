@@ -52,7 +52,7 @@ def test_marked_pixels_hold_no_counts_and_a_counter_needs_no_darks(
 ) -> None:
     path = _scan(tmp_path / "s.nx", rng, dtype, mark, MASK if stated else None)
     with open_scan(path) as source:
-        assert source.image_key[0] == 2
+        assert source.table.kinds[0] == 2
         assert not source.read([0]).any()
         assert not source.read([1, -1])[:, MASK > 0].any()
         np.testing.assert_array_equal(source.read([-1], slice(10, 20))[0], source.read([-1])[0, 10:20])

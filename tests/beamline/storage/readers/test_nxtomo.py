@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from beamline.core.errors import DataError
 from beamline.monitor.digest import digest
 from beamline.storage.readers.open import NotReadyError, SourceOptions, open_scan
-from beamline.storage.readers.replacements import overlaid
+from beamline.storage.readers.reference_files import overlaid
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.storage.conftest import EPOCH, INFO
@@ -69,18 +69,18 @@ def test_replay_yields_the_same_frames(frames: list[Frame], flush_every: int) ->
 def test_each_frame_has_its_own_exposure(tmp_path: Path, write: Write, frames: list[Frame]) -> None:
     own = [replace(frame, exposure=0.01 * (frame.index + 1)) for frame in frames]
     with open_scan(write(own)) as source:
-        np.testing.assert_allclose(source.exposures, 0.01 * np.arange(1, 15))
+        np.testing.assert_allclose(source.table.exposures, 0.01 * np.arange(1, 15))
     with open_scan(SourceOptions(tmp_path / "scan.h5", flats=np.ones((2, 12, 16), np.uint16))) as source:
-        np.testing.assert_allclose(source.exposures, [np.nan] * 2 + [frame.exposure for frame in own])
+        np.testing.assert_allclose(source.table.exposures, [np.nan] * 2 + [frame.exposure for frame in own])
     with open_scan(foreign(tmp_path / "ms.nxs")) as source:
-        np.testing.assert_allclose(source.exposures, np.full(6, 0.02))
+        np.testing.assert_allclose(source.table.exposures, np.full(6, 0.02))
     for values, expected in (([20.0], [0.02] * 6), ([0, 0, 0, 20, 20, 20], [np.nan] * 3 + [0.02] * 3)):
         with h5py.File(foreign(tmp_path / "f.nxs"), "r+") as file:
             del file["entry1/tomo_entry/instrument/detector/count_time"]
             file["entry1/tomo_entry/instrument/detector/count_time"] = values
             file["entry1/tomo_entry/instrument/detector/count_time"].attrs["units"] = "ms"
         with open_scan(tmp_path / "f.nxs") as source:
-            np.testing.assert_allclose(source.exposures, expected)
+            np.testing.assert_allclose(source.table.exposures, expected)
 
 
 def foreign(path: Path, *, units: str | None = "degree", dtype: str = "u2", entry: str = "entry1/tomo_entry") -> Path:
@@ -104,7 +104,7 @@ def foreign(path: Path, *, units: str | None = "degree", dtype: str = "u2", entr
 
 def test_a_foreign_nxtomo_in_savus_place(tmp_path: Path) -> None:
     with open_scan(foreign(tmp_path / "f.nxs")) as source:
-        np.testing.assert_allclose(source.angles[2:5], [0, np.pi / 2, np.pi])
+        np.testing.assert_allclose(source.table.angles[2:5], [0, np.pi / 2, np.pi])
         assert source.pixel_size_mm == pytest.approx(0.0025)
         assert source.energy_kev == pytest.approx(30.5)
         assert source.axis_col is None
@@ -118,14 +118,14 @@ def test_the_ring_current_of_each_frame(tmp_path: Path) -> None:
     """0 and what is no number are unknown; laid-over references have none."""
     path = foreign(tmp_path / "f.nxs")
     with open_scan(path) as source:
-        assert source.currents is None
+        assert source.table.currents is None
     with h5py.File(path, "r+") as file:
         file["entry1/tomo_entry/control/data"] = [0.0, 199.5, 200.0, 190.0, 180.0, np.nan]
     with open_scan(path) as source:
-        np.testing.assert_array_equal(source.currents, [np.nan, 199.5, 200.0, 190.0, 180.0, np.nan])
+        np.testing.assert_array_equal(source.table.currents, [np.nan, 199.5, 200.0, 190.0, 180.0, np.nan])
     with open_scan(path) as source:
         over = overlaid(source, darks=np.zeros((2, 4, 5), np.uint16))
-        np.testing.assert_array_equal(over.currents, [np.nan] * 3 + [199.5, 200.0, 190.0, 180.0, np.nan])
+        np.testing.assert_array_equal(over.table.currents, [np.nan] * 3 + [199.5, 200.0, 190.0, 180.0, np.nan])
 
 
 @pytest.mark.parametrize(("units", "said"), [(None, "no units attribute"), ("mm", "units 'mm'")])
@@ -133,19 +133,17 @@ def test_angles_without_a_unit_are_refused_unless_the_caller_brings_angles(
     tmp_path: Path, units: str | None, said: str
 ) -> None:
     with open_scan(foreign(tmp_path / "f.nxs", units="rad")) as source:
-        assert source.angles[3] == 90
+        assert source.table.angles[3] == 90
     path = foreign(tmp_path / "f.nxs", units=units)
     with pytest.raises(DataError, match=said):
         open_scan(path)
     with open_scan(SourceOptions(path, angles=[0.0, 1.0, 2.0])) as source:
-        np.testing.assert_array_equal(source.angles, [np.nan, np.nan, 0, 1, 2, np.nan])
+        np.testing.assert_array_equal(source.table.angles, [np.nan, np.nan, 0, 1, 2, np.nan])
 
 
-def test_float_frames_are_of_unknown_quantity_and_no_frames_of_a_camera(tmp_path: Path) -> None:
+def test_float_frames_are_of_unknown_quantity_and_stay_floats(tmp_path: Path) -> None:
     with open_scan(foreign(tmp_path / "f.nxs", dtype="f4")) as source:
-        assert source.quantity == "unknown"
-        with pytest.raises(DataError, match="uint16"):
-            next(source.frames())
+        assert source.quantity == "unknown" and next(source.frames()).counts.dtype == np.float32
 
 
 def test_several_entries_need_a_default(tmp_path: Path) -> None:
@@ -158,7 +156,7 @@ def test_several_entries_need_a_default(tmp_path: Path) -> None:
     with h5py.File(path, "r+") as file:
         file.attrs["default"] = "entry0001"
     with open_scan(path) as source:
-        np.testing.assert_allclose(source.angles, np.radians(7))
+        np.testing.assert_allclose(source.table.angles, np.radians(7))
 
 
 def test_frames_in_a_linked_file_that_is_gone(tmp_path: Path) -> None:
@@ -261,23 +259,23 @@ def test_a_file_that_is_not_there_yet_can_be_waited_for(tmp_path: Path) -> None:
 def test_diamond_nexus_with_external_links(shared_data: Path) -> None:
     with open_scan(shared_data / "fixtures" / "diad_k11-18014.nxs") as source:
         assert (source.format, source.shape, source.quantity) == ("diamond_nexus", (22, 26), "counts")
-        assert np.bincount(source.image_key).tolist() == [3001, 100, 100]
-        assert np.isnan(source.angles).all()  # they are in a file that did not come with it
+        assert np.bincount(source.table.kinds).tolist() == [3001, 100, 100]
+        assert np.isnan(source.table.angles).all()  # they are in a file that did not come with it
         assert "gts_theta_value_set" in str(source.attributes["angles"])
         with h5py.File(shared_data / "fixtures" / "k11-18014" / "k11-18014-imaging.h5") as pixels:
             np.testing.assert_array_equal(source.read([0, 3200]), pixels["entry/detector/detector"][[0, 3200]])
     angles = np.linspace(0, np.pi, 3001)
     with open_scan(SourceOptions(shared_data / "fixtures" / "diad_k11-18014.nxs", angles=angles)) as source:
-        np.testing.assert_array_equal(source.angles[source.image_key == 0], angles)
+        np.testing.assert_array_equal(source.table.angles[source.table.kinds == 0], angles)
 
 
 def test_esrf_nxtomo(shared_data: Path) -> None:
     with open_scan(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx") as source:
         assert source.format == "nxtomo"
-        assert [int((source.image_key == kind).sum()) for kind in (0, 1, 2, -1)] == [11, 2, 2, 5]
+        assert [source.table.of_kind(kind).size for kind in (0, 1, 2, -1)] == [11, 2, 2, 5]
         assert (source.pixel_size_mm, source.energy_kev) == (pytest.approx(6.69e-4), 26.0)
         assert source.axis_col is None  # 0.0 in the file, which counts from the middle
-        np.testing.assert_allclose(np.degrees(source.angles[4:15]), np.linspace(0, 360, 11), atol=1e-6)
+        np.testing.assert_allclose(np.degrees(source.table.angles[4:15]), np.linspace(0, 360, 11), atol=1e-6)
 
 
 @pytest.mark.parametrize(("dtype", "said"), [("S3", "text"), ("c8", "complex numbers")])

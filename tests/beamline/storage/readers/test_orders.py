@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import permutations
 from pathlib import Path
 
@@ -10,10 +11,15 @@ import numpy as np
 import pytest
 import tifffile
 import zarr
+from PIL import Image
 
 from beamline.core.errors import DataError
+from beamline.core.sinks import Note
 from beamline.features.files.validate import describe, validate
+from beamline.projections.selection import Selection
+from beamline.projections.views import checked_views
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.stored_order import SINOGRAM
 
 VIEWS = np.arange(5 * 3 * 4, dtype=np.float32).reshape(5, 3, 4)
 NAMES = ("view", "row", "col")
@@ -46,7 +52,7 @@ def test_a_dimension_of_one_is_none(tmp_path: Path, at: int) -> None:
     with h5py.File(tmp_path / "s.h5", "w") as file:
         file["d"], file["w"], file["k"] = np.expand_dims(VIEWS, at), VIEWS[:2, None], VIEWS[None, 0]
     with open_scan(SourceOptions(tmp_path / "s.h5", data_path="d", flats_path="w", darks_path="k")) as source:
-        assert source.image_key.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
+        assert source.table.kinds.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
         np.testing.assert_array_equal(source.read(slice(3, None)), VIEWS)
 
 
@@ -56,13 +62,78 @@ def test_one_image_with_as_many_rows_or_columns_as_angles_is_a_sinogram(tmp_path
     np.save(tmp_path / "s.npy", sinogram)
     np.save(tmp_path / "one.npy", sinogram[None])
     tifffile.imwrite(tmp_path / "s.tif", sinogram)
+    Image.fromarray(sinogram.astype(np.uint16)).save(tmp_path / "s.png")
     with h5py.File(tmp_path / "s.h5", "w") as file:
         file["d"] = sinogram
-    scans = [SourceOptions(tmp_path / name, angles=ANGLES) for name in ("s.npy", "one.npy", "s.tif")]
+    np.save(tmp_path / "columns.npy", VIEWS[:, 1].T[..., None])
+    names = ("s.npy", "one.npy", "s.tif", "s.png", "columns.npy")
+    scans = [SourceOptions(tmp_path / name, angles=ANGLES) for name in names]
     for scan in (*scans, SourceOptions(tmp_path / "s.h5", data_path="d", angles=ANGLES)):
         with open_scan(scan) as source:
             np.testing.assert_array_equal(source.read(slice(None)), VIEWS[:, 1:2])
-            np.testing.assert_array_equal(source.angles, ANGLES)
+            np.testing.assert_array_equal(source.table.angles, ANGLES)
+
+
+@pytest.mark.parametrize(("turned", "other"), [(False, "--order col,view"), (True, "--order view,col")])
+def test_a_sinogram_is_said_to_be_one(tmp_path: Path, turned: bool, other: str) -> None:
+    rng = np.random.default_rng(0)
+    sinogram = rng.uniform(1, 2, (20, 9)).astype(np.float32)
+    np.save(tmp_path / "s.npy", sinogram.T if turned else sinogram)
+    with open_scan(SourceOptions(tmp_path / "s.npy", angles=np.arange(20) * 0.1, quantity="line_integrals")) as source:
+        sentences = list[str]()
+        checked_views(source, Selection(), sentences.append)
+    (said,) = [each for each in sentences if "sinogram" in each]
+    assert isinstance(said, Note) and "20 views and 9 columns" in said and other in said
+
+
+def test_a_sinogram_of_data_exchange_is_said_to_be_one(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        file["exchange/data"], file["exchange/theta"] = VIEWS[:, 0].T.astype(np.uint16), np.arange(5) * 30
+        file["exchange/data"].attrs["axes"] = "x:theta"
+    (said,) = [each.message for each in validate(tmp_path / "s.h5") if each.rule == SINOGRAM]
+    assert "5 views and 4 columns" in said and "(theta:x)" in said
+
+
+@pytest.mark.parametrize("packed", [np.savez, np.savez_compressed])
+def test_an_npz_is_read_by_its_names(tmp_path: Path, packed: Callable[..., None]) -> None:
+    """Without pickle; the only array of images needs no name."""
+    packed(tmp_path / "s.npz", projections=VIEWS, angles=ANGLES)
+    packed(tmp_path / "refs.npz", flat=VIEWS[:2] + 1, dark=VIEWS[0])
+    references = {f"{name}s": f"{tmp_path / 'refs.npz'}::{name}" for name in ("flat", "dark")}
+    for own in ({}, {"data_path": "projections"}):
+        scan = SourceOptions(tmp_path / "s.npz", angles_path="angles", angles_unit="rad", **own, **references)  # type: ignore[arg-type]
+        with open_scan(scan) as source:
+            assert source.table.kinds.tolist() == [2, 1, 1, 0, 0, 0, 0, 0]
+            np.testing.assert_array_equal(source.read(slice(1, None)), np.concatenate([VIEWS[:2] + 1, VIEWS]))
+            np.testing.assert_allclose(source.table.angles[3:], ANGLES)
+    with pytest.raises(DataError, match=r"no dataset b.* It has /projections \(5 x 3 x 4\), /angles \(5\)"):
+        open_scan(SourceOptions(tmp_path / "s.npz", data_path="b"))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:300])
+    with pytest.raises(DataError, match=r"cut.npz is damaged.*BadZipFile"):
+        open_scan(SourceOptions(tmp_path / "cut.npz", angles=ANGLES))
+
+
+@pytest.mark.parametrize("name", ["s.npy", "s.npz"])
+def test_objects_of_python_are_refused_as_pickles(tmp_path: Path, name: str) -> None:
+    (np.save if name == "s.npy" else np.savez)(tmp_path / name, np.array([{}], object))
+    with pytest.raises(DataError, match=r"objects of Python among its arrays, which are pickles.*numpy.save"):
+        open_scan(SourceOptions(tmp_path / name, angles=ANGLES))
+
+
+def test_what_is_no_sinogram_of_so_many_angles_is_said(tmp_path: Path) -> None:
+    np.save(tmp_path / "s.npy", VIEWS[:, 1])
+    with pytest.raises(DataError, match=r"has 9 angles, and .* holds one image of 5 x 4 pixels. As a sinogram"):
+        open_scan(SourceOptions(tmp_path / "s.npy", angles=np.arange(9.0)))
+
+
+def test_lists_of_a_file_that_may_be_its_angles_are_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "s.npz", projections=VIEWS, theta=ANGLES, x=np.arange(4))
+    (said,) = [
+        hit.message
+        for hit in validate(SourceOptions(tmp_path / "s.npz", data_path="projections"))
+        if hit.rule == "angles"
+    ]
+    assert "--angles-path /theta takes those of /theta" in said
 
 
 def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
@@ -75,7 +146,7 @@ def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
     apart = SourceOptions(tmp_path / "s.npy", angles=ANGLES, flats=tmp_path / "w.npy", darks=tmp_path / "k.npy")
     for scan in (apart, SourceOptions(tmp_path / "s.h5")):
         with open_scan(scan) as source:
-            assert source.image_key.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
+            assert source.table.kinds.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
             expected = np.concatenate([counts[:1, 2], counts[:3, 1], counts[:, 0]])[:, None]
             np.testing.assert_array_equal(source.read(slice(None)), expected)
 
@@ -122,7 +193,9 @@ def test_a_zarr_is_read_as_hdf5_is(tmp_path: Path) -> None:
     found = []
     for name in ("s.h5", "s.zarr"):
         with open_scan(tmp_path / name) as source:
-            found.append((source.format, source.quantity, source.image_key.tolist(), source.angles[2:].tolist()))
+            found.append(
+                (source.format, source.quantity, source.table.kinds.tolist(), source.table.angles[2:].tolist())
+            )
             np.testing.assert_array_equal(source.read(slice(2, None)), VIEWS)
     assert found[0] == found[1]
 

@@ -14,6 +14,7 @@ from beamline.core.errors import DataError
 from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
+from beamline.storage.frame_table import FrameTable
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.scan import parts_joined
@@ -45,23 +46,24 @@ def test_it_is_the_joined_scan(tmp_path: Path, rng: np.random.Generator) -> None
         with _writer(path) as writer:
             _append(writer, some, replaces=5)
     join(parts, tmp_path / "joined.h5")
-    fields, flags = ("image_key", "angles", "exposures", "replaces", "part_starts"), ("bits", "scores", "regions")
+    fields = [name for name in FrameTable.__annotations__ if name != "flags"]
+    flags = ("bits", "scores", "regions")
     chosen: tuple[Any, ...] = (slice(None), rng.permutation(25), [24, 3, -1, 8], [])
     with open_scan(tmp_path / "joined.h5") as joined:  # not while the parts are open in another mode
-        expected = {name: getattr(joined, name) for name in (*fields, "plan", "checksummed")}
-        flagged, pixels = joined.flags, [joined.read(rows, slice(1, 3)) for rows in chosen]
+        expected, plan, checksummed = joined.table, joined.plan, joined.checksummed
+        flagged, pixels = expected.flags, [joined.read(rows, slice(1, 3)) for rows in chosen]
     with SourceOptions(parts[-1], earlier=tuple(parts[:-1])).open(follow=True) as source:
         assert source.refresh() == 25
         for name in fields:
-            np.testing.assert_array_equal(getattr(source, name), expected[name])
+            np.testing.assert_array_equal(getattr(source.table, name), getattr(expected, name))
         for name in flags:
-            np.testing.assert_array_equal(getattr(source.flags, name), getattr(flagged, name))
+            np.testing.assert_array_equal(getattr(source.table.flags, name), getattr(flagged, name))
         for rows, seen in zip(chosen, pixels, strict=True):
             np.testing.assert_array_equal(source.read(rows, slice(1, 3)), seen)
-        assert (source.finished, source.checksummed, source.plan) == (True, expected["checksummed"], expected["plan"])
+        assert (source.finished, source.checksummed, source.plan) == (True, checksummed, plan)
         assert list(parts_joined(source)) == []  # it is all of it
     with SourceOptions(parts[-1], earlier=tuple(parts[:-1]), quantity="counts").open() as replaced:
-        assert replaced.image_key.size == 25
+        assert len(replaced.table) == 25
 
 
 def test_its_last_part_grows(tmp_path: Path) -> None:
@@ -71,11 +73,12 @@ def test_its_last_part_grows(tmp_path: Path) -> None:
     with _writer(tmp_path / "two.h5") as writer:
         options = SourceOptions(tmp_path / "two.h5", earlier=(tmp_path / "one.h5",))
         with options.open(follow=True) as source:
-            assert (source.image_key.size, source.part_starts.tolist(), source.finished) == (6, [0, 6], False)
+            assert (len(source.table), source.table.part_starts.tolist(), source.finished) == (6, [0, 6], False)
             _append(writer, frames[6:8])
             assert source.refresh() == 8
             np.testing.assert_array_equal(source.read([7])[0], frames[7].counts)
-            assert source.flags is not None and source.flags.flagged.tolist() == [False] * 5 + [True, False, True]
+            flags = source.table.flags
+            assert flags is not None and flags.flagged.tolist() == [False] * 5 + [True, False, True]
 
 
 def test_damaged_frames_are_counted_over_all_parts(tmp_path: Path) -> None:

@@ -40,9 +40,9 @@ def test_one_of_two_detectors_is_named_by_a_path_or_by_the_file(tmp_path: Path, 
         open_scan(path)
     for named in (f"/entry/instrument/camera{k}/data", f"entry/plot{k}/data"):
         with open_scan(SourceOptions(path, data_path=named)) as source:
-            assert source.image_key.tolist() == KEYS.tolist() and source.quantity == "counts"
+            assert source.table.kinds.tolist() == KEYS.tolist() and source.quantity == "counts"
             np.testing.assert_array_equal(source.read(slice(None)), frames(k))
-            np.testing.assert_allclose(np.degrees(source.angles), ANGLES)
+            np.testing.assert_allclose(np.degrees(source.table.angles), ANGLES)
     with h5py.File(path, "r+") as file:
         file.attrs["default"], file["entry"].attrs["default"] = "entry", f"plot{k}"
         file[f"entry/plot{k}"].attrs["signal"] = "data"

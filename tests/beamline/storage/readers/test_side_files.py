@@ -110,13 +110,13 @@ def test_distances_pixels_and_angles_are_taken(images: Path, name: str, encoding
     side.write_text(text, encoding=encoding)
     with open_scan(images) as source:  # not named: nothing of it is used
         assert (source.cone, source.pixel_size_mm) == (None, None)
-        assert np.isnan(source.angles).all()
+        assert np.isnan(source.table.angles).all()
         assert [field.where for field in source.not_used] == [name]
     assert [f.message for f in validate(images) if f"--from {side}" in f.message]
     with open_scan(SourceOptions(images, side_file=side, quantity="counts")) as source:
         assert source.cone == pytest.approx((60, 300))
         assert source.pixel_size_mm == pytest.approx(0.2)
-        np.testing.assert_allclose(np.degrees(source.angles[-N:]), first + 60 * np.arange(N))
+        np.testing.assert_allclose(np.degrees(source.table.angles[-N:]), first + 60 * np.arange(N))
         assert source.not_used == ()
         white = [FILES[name][0] == NIKON and each for each in source.read(slice(None))[:, 0, 0].tolist()]
         assert white[:2] == ([0, 60_000] if FILES[name][0] == NIKON else [False, False])

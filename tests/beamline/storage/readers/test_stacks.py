@@ -46,19 +46,19 @@ def test_a_unit_that_is_given_goes_before_the_file(path: Path, unit: str) -> Non
     for where, values in (("/motors/omega", np.linspace(0, np.pi, 5)), ("/motors/plain", np.linspace(0, 180, 5))):
         with open_scan(SourceOptions(path, **{**PATHS, "angles_path": where}, angles_unit=unit)) as source:
             expected = values if unit == "rad" else np.radians(values)
-            np.testing.assert_allclose(source.angles[5:], expected)
+            np.testing.assert_allclose(source.table.angles[5:], expected)
 
 
 def test_a_reference_may_be_a_single_image(path: Path, images: np.ndarray) -> None:
     with open_scan(SourceOptions(path, **{**PATHS, "darks_path": "/raw/before/one"})) as source:
-        assert source.image_key.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
+        assert source.table.kinds.tolist() == [2, 1, 1, 1, 0, 0, 0, 0, 0]
         np.testing.assert_array_equal(source.read([0])[0], images[0])
 
 
 def test_what_is_not_named_is_not_there(path: Path, images: np.ndarray) -> None:
     with open_scan(SourceOptions(path, data_path="raw/images")) as source:
-        assert (source.quantity, source.image_key.tolist()) == ("unknown", [0] * 5)
-        assert np.isnan(source.angles).all()
+        assert (source.quantity, source.table.kinds.tolist()) == ("unknown", [0] * 5)
+        assert np.isnan(source.table.angles).all()
         np.testing.assert_array_equal(source.read(slice(None)), images[5:])
 
 
@@ -69,7 +69,7 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
     for where in ("/motors/omega", "/motors/text"):
         with open_scan(SourceOptions(path, angles_path=where)) as source:
             assert source.format == "data_exchange"
-            np.testing.assert_allclose(source.angles, np.linspace(0, np.pi, 5))
+            np.testing.assert_allclose(source.table.angles, np.linspace(0, np.pi, 5))
 
 
 @pytest.mark.parametrize(

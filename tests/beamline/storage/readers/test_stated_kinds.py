@@ -32,14 +32,14 @@ def series(tmp_path: Path) -> Path:
 
 def test_ranges_of_a_numbered_series_are_the_kinds_of_its_frames(series: Path) -> None:
     with open_scan(series) as source:
-        assert (source.image_key == DARK).sum() == 6  # by their names
+        assert (source.table.kinds == DARK).sum() == 6  # by their names
     with open_scan(SourceOptions(series, frames="darks=0:1,flats=1:3+9:10", angles=np.arange(6) * 0.5)) as source:
-        assert source.image_key.tolist() == [DARK, FLAT, FLAT, *[VIEW] * 6, FLAT]
+        assert source.table.kinds.tolist() == [DARK, FLAT, FLAT, *[VIEW] * 6, FLAT]
         assert source.read(slice(None))[:, 0, 0].tolist() == list(range(10))
         assert source.quantity == "counts"
-        np.testing.assert_allclose(source.angles[3:9], np.arange(6) * 0.5)
+        np.testing.assert_allclose(source.table.angles[3:9], np.arange(6) * 0.5)
     with open_scan(SourceOptions(series, frames="darks=:1, flats=1:3, views=3:6")) as source:
-        assert source.image_key.tolist() == [DARK, FLAT, FLAT, VIEW, VIEW, VIEW, *[NONE] * 4]
+        assert source.table.kinds.tolist() == [DARK, FLAT, FLAT, VIEW, VIEW, VIEW, *[NONE] * 4]
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_views_are_selected_in_turn_with_their_references(tmp_path: Path, frames
     pixels = np.arange(16, dtype=np.uint16)[:, None, None] * np.ones(SHAPE, np.uint16)
     path = write_nxtomo(tmp_path / "s.nxs", pixels, key.tolist(), 10.0 * np.arange(16))
     with open_scan(SourceOptions(path, frames=frames)) as source:
-        assert np.flatnonzero(source.image_key != NONE).tolist() == taken
+        assert np.flatnonzero(source.table.kinds != NONE).tolist() == taken
         np.testing.assert_array_equal(source.read([3, 9])[:, 0, 0], [3, 9])
 
 
@@ -82,9 +82,9 @@ def test_angles_are_those_of_all_views_or_of_the_selected_ones(series: Path) -> 
     kinds = "darks=0:1,flats=1:2,1::2"
     for angles in (np.arange(8.0), np.arange(8)[1::2]):
         with open_scan(SourceOptions(series, frames=kinds, angles=angles)) as source:
-            views = source.image_key == VIEW
+            views = source.table.kinds == VIEW
             assert source.read(np.flatnonzero(views))[:, 0, 0].tolist() == [3, 5, 7, 9]
-            np.testing.assert_allclose(source.angles[views], [1, 3, 5, 7])
+            np.testing.assert_allclose(source.table.angles[views], [1, 3, 5, 7])
     with pytest.raises(DataError, match=r"selects no view: .* has 8"):
         open_scan(SourceOptions(series, frames="darks=0:1,flats=1:2,8:", angles=np.arange(8.0)))
 
@@ -98,10 +98,10 @@ def test_a_scan_in_several_files_is_read_as_one(tmp_path: Path) -> None:
         paths.append(write_nxtomo(tmp_path / f"{name}.nxs", frames, key, 10.0 * numbers))
     with open_scan(SourceOptions(paths[0], then=tuple(paths[1:]))) as source:
         assert source.path == paths[0]
-        assert source.image_key.tolist() == [2, 2, 1, 1, 1, *[0] * 5]
+        assert source.table.kinds.tolist() == [2, 2, 1, 1, 1, *[0] * 5]
         assert source.read(slice(None))[:, 1, 1].tolist() == list(range(10))
-        np.testing.assert_allclose(np.degrees(source.angles[5:]), 10.0 * np.arange(5, 10))
-        assert source.part_starts.tolist() == [0]  # no file is a part that should have flats of its own
+        np.testing.assert_allclose(np.degrees(source.table.angles[5:]), 10.0 * np.arange(5, 10))
+        assert source.table.part_starts.tolist() == [0]  # no file is a part that should have flats of its own
     with pytest.raises(DataError, match=r"gone\.nxs does not exist"):
         open_scan(SourceOptions(paths[0], then=(tmp_path / "gone.nxs",)))
     with pytest.raises(DataError, match="cannot be followed with --then"):
@@ -115,7 +115,7 @@ def test_views_of_two_energies_are_refused_and_one_can_be_chosen(tmp_path: Path)
     assert hit.severity == "error" and "3 at 20 keV, 2 at 30 keV" in hit.message
     with open_scan(SourceOptions(path, frames="energy=20", darks=FRAMES[:2])) as source:
         assert source.energy_kev == 20
-        assert source.image_key.tolist() == [2, 2, 3, 1, 0, 3, 0, 3, 0]
+        assert source.table.kinds.tolist() == [2, 2, 3, 1, 0, 3, 0, 3, 0]
     assert not [hit for hit in validate(SourceOptions(path, frames="energy=20")) if hit.rule == "energies"]
     with pytest.raises(DataError, match=r"no frame of .* has this energy; 4 at 20 keV, 2 at 30 keV"):
         open_scan(SourceOptions(path, frames="energy=25"))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from beamline.features.files.validate import validate
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from beamline.storage.readers.transforms import type_wrapped
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import TwoCylinders, write_exchange, write_nxtomo
@@ -69,8 +69,8 @@ def test_they_are_read_from_any_format_and_named(tmp_path: Path, kind: str) -> N
         options = SourceOptions(path)
     with open_scan(options) as source:
         assert source.dtype == np.uint16 and source.quantity == "counts"
-        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == 0)), counts)
-        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == 1)), flats)
+        np.testing.assert_array_equal(source.read(np.flatnonzero(source.table.kinds == 0)), counts)
+        np.testing.assert_array_equal(source.read(np.flatnonzero(source.table.kinds == 1)), flats)
         np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], counts[-1])
     assert any("int16 that wrapped, read as uint16" in finding.message for finding in validate(options))
 
@@ -83,5 +83,5 @@ def test_views_that_wrapped_beside_flats_of_another_type_are_read(tmp_path: Path
     changes = {"data": counts.view(np.int16), "data_white": flats.view(flats_as)}
     with open_scan(write_exchange(tmp_path / "s.h5", SCAN, changes)) as source:
         assert source.dtype == np.uint16 and "wrapped" in str(source.attributes["pixels"])
-        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.PROJECTION)), counts)
-        np.testing.assert_array_equal(source.read(np.flatnonzero(source.image_key == FrameKind.FLAT)), flats)
+        np.testing.assert_array_equal(source.read(source.table.views), counts)
+        np.testing.assert_array_equal(source.read(source.table.flats), flats)

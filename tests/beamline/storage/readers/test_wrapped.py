@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pytest
 
+from beamline.features.files.validate import source_findings
+from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.transforms import wrapped_edges
+from tests.beamline.array_source import scan_of
 
 COLS = np.arange(256) - 127.5
 SAMPLE = 1.3 * np.cos(np.pi / 2 * np.minimum(np.abs(COLS) / 80, 1)) ** 2
@@ -22,11 +27,14 @@ def test_what_is_brighter_than_the_type_begins_again(light: float, profile: floa
     assert edges > 0 and not below
 
 
-def test_what_is_below_the_dark_goes_on_at_the_end_and_is_told_from_it() -> None:
-    images = counts(3e4).astype(np.int64) - 400
-    images[:, :, 120:140] = np.random.default_rng(1).normal(0, 8, (2, 32, 20)).round()  # behind metal
-    edges, below = wrapped_edges((images % 2**16).astype(np.uint16), np.dtype(np.uint16))
-    assert edges > 0 and below
+@pytest.mark.parametrize("light", [3e4, 5e4, 5.8e4, 6.2e4, 6.4e4])
+def test_what_is_below_the_dark_goes_on_at_the_end_and_is_told_from_it(light: float) -> None:
+    """Also beside air near the end, whose sharp edge is no step of the numbers."""
+    rng = np.random.default_rng(1)
+    images, flat = counts(light).astype(np.int64) - 400, np.random.default_rng(2).poisson(light, (32, 256))
+    images[:, :, 20:140] = rng.normal(0, 8, (2, 32, 120)).round()  # behind metal
+    edges, below = wrapped_edges((images % 2**16).astype(np.uint16), np.dtype(np.uint16), flat)
+    assert edges > 0 and images.max() < below < 2**16 - 40
 
 
 def test_light_that_is_cut_off_hot_pixels_and_zingers_have_not_wrapped() -> None:
@@ -39,7 +47,7 @@ def test_light_that_is_cut_off_hot_pixels_and_zingers_have_not_wrapped() -> None
     dim = counts(500)
     dim[:, ::5, ::13] = 65_000
     for some in (cut, slit, images, dim):
-        assert wrapped_edges(some.astype(np.uint16), np.dtype(np.uint16)) == (0, False)
+        assert wrapped_edges(some.astype(np.uint16), np.dtype(np.uint16)) == (0, 0)
 
 
 @pytest.mark.parametrize("light", [62_000, 64_500])
@@ -48,6 +56,17 @@ def test_opaque_matter_with_sharp_edges_in_bright_light_has_not_wrapped(light: f
     chord = 2 * np.sqrt(np.maximum(80.0**2 - COLS**2, 0))
     draw = np.random.default_rng(3).poisson
     images, flat = draw(light * np.exp(np.broadcast_to(-0.3 * chord, (2, 32, 256)))), draw(light, (32, 256))
-    assert wrapped_edges(images.astype(np.uint16), np.dtype(np.uint16), flat) == (0, False)
+    assert wrapped_edges(images.astype(np.uint16), np.dtype(np.uint16), flat) == (0, 0)
     bright = (counts(80_000) % 2**16).astype(np.uint16), np.dtype(np.uint16)
     assert wrapped_edges(*bright, np.full((32, 256), 80_400 % 2**16)) == wrapped_edges(*bright)
+
+
+@pytest.mark.parametrize(("dtype", "light"), [(np.uint16, 7.2e4), (np.int16, 7.2e4), (np.int16, 9e4)])
+def test_validate_says_that_numbers_wrapped_and_nothing_of_the_light(dtype: type, light: float) -> None:
+    """With a sign, 65,536 and more is again above 0, beside darker matter far below 0 without any step."""
+    views, flats = counts(light, 0.1).repeat(6, axis=0), np.random.default_rng(5).poisson(light, (3, 32, 256)) + 400
+    darks = np.random.default_rng(6).normal(400, 3, (3, 32, 256)).round()
+    parts = [part.astype(np.int64).astype(np.uint16).view(dtype) for part in (darks, flats, views)]
+    source = scan_of(*parts, np.linspace(0, np.pi, 12, endpoint=False), dtype)
+    found = source_findings(cast(ScanSource, source))
+    assert [finding.rule for finding in found if finding.severity != "info"] == ["wrapped-numbers"]

@@ -68,8 +68,8 @@ def known(source: ScanSource, references: int) -> None:
     """All frames of the source are those that were written, with their kinds and angles."""
     n = source.refresh()
     np.testing.assert_array_equal(source.read(slice(None)), FRAMES[:n])
-    np.testing.assert_array_equal(source.image_key, KEY[:n])
-    np.testing.assert_allclose(np.degrees(source.angles[references:]), ANGLES[references:n])
+    np.testing.assert_array_equal(source.table.kinds, KEY[:n])
+    np.testing.assert_allclose(np.degrees(source.table.angles[references:]), ANGLES[references:n])
 
 
 def test_frames_are_there_with_their_angles_and_the_file_is_finished_when_it_is_closed(
@@ -79,7 +79,7 @@ def test_frames_are_there_with_their_angles_and_the_file_is_finished_when_it_is_
     writer.write(own + 2)
     with open_scan(tmp_path / "scan.h5", follow=True) as source:
         known(source, 2)
-        assert not source.finished and source.image_key.size == 4
+        assert not source.finished and len(source.table) == 4
         writer.write(own + 4, only_frames=True)  # their angles are still in the writer's memory
         assert source.refresh() == 4
         writer.write(own + 4)
@@ -100,7 +100,7 @@ def test_room_for_frames_is_no_frame(tmp_path: Path) -> None:
             item[:n] = values[:n]
             item.flush()
         with open_scan(tmp_path / "scan.h5", follow=True) as source:
-            assert source.image_key.size == n
+            assert len(source.table) == n
     writer.file.close()
 
 
@@ -112,11 +112,11 @@ def test_flats_that_come_after_the_views_are_numbered_after_them(tmp_path: Path)
         file["exchange/theta"] = [0.0, 36]
         file.swmr_mode = True
         with open_scan(tmp_path / "scan.h5", follow=True) as source:
-            assert source.image_key.tolist() == [FrameKind.FLAT, 0, 0]
+            assert source.table.kinds.tolist() == [FrameKind.FLAT, 0, 0]
             white.resize(3, 0)
             white[1:] = FRAMES[5:7]
             white.flush()
-            assert source.refresh() == 5 and source.image_key.tolist() == [1, 0, 0, 1, 1]
+            assert source.refresh() == 5 and source.table.kinds.tolist() == [1, 0, 0, 1, 1]
             np.testing.assert_array_equal(source.read(slice(None)), FRAMES[[1, 2, 3, 5, 6]])
 
 

@@ -39,7 +39,7 @@ def scan(balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], a
 
 
 def told(source: ArraySource) -> list[Finding]:
-    seen = coarse_views(source)  # type: ignore[arg-type]
+    seen = coarse_views(source)
     return [] if seen is None else list(angles_seen(seen))
 
 
@@ -89,7 +89,7 @@ def test_a_rod_about_an_axis_far_from_the_middle_is_never_refused(axis: float) -
 
 
 def ordered(source: ArraySource) -> list[Finding]:
-    seen = coarse_views(source)  # type: ignore[arg-type]
+    seen = coarse_views(source)
     return [] if seen is None else list(angles_in_order(seen))
 
 

@@ -34,7 +34,7 @@ def told(darks: np.ndarray, flats: np.ndarray, views: np.ndarray, exposures: np.
     darks, flats, views = (np.clip(np.round(each), 0, 65535) for each in (darks, flats, views))
     source = scan_of(darks, flats, views, ANGLES)
     if exposures is not None:
-        source.exposures = exposures
+        source.state(exposures=exposures)
     try:
         return " ".join(prepare(source, Selection(axis_col=31.5))[1])
     except DataError as error:

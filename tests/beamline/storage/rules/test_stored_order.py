@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from beamline.features.files.validate import validate
+from beamline.storage.readers.base import Quantity
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules import Finding
 from beamline.storage.rules.stored_order import change_of_rows, pixels_as_labelled, views_first
@@ -31,19 +32,21 @@ def line_integrals(seed: int, turn: float) -> tuple[NDArray[np.float64], NDArray
     return lines + 0.02 * rng.standard_normal(lines.shape), angles
 
 
-def told(data: NDArray[np.float64], angles: NDArray[np.float64], quantity: str = "line_integrals") -> list[Finding]:
+def told(
+    data: NDArray[np.float64], angles: NDArray[np.float64], quantity: Quantity = "line_integrals"
+) -> list[Finding]:
     source = ArraySource(data, [0] * len(data), angles)
     source.quantity = quantity
-    return list(views_first(source))  # type: ignore[arg-type]
+    return list(views_first(source))
 
 
 @pytest.mark.parametrize("turn", [np.pi, 2 * np.pi])
-@pytest.mark.parametrize("quantity", ["line_integrals", "transmission"])
-def test_sinograms_are_told_from_views(turn: float, quantity: str) -> None:
+@pytest.mark.parametrize("quantity", ["line_integrals", "unknown"])  # unknown: transmission
+def test_sinograms_are_told_from_views(turn: float, quantity: Quantity) -> None:
     missed = 0
     for seed in range(12):
         lines, angles = line_integrals(seed, turn)
-        data = np.exp(-lines) if quantity == "transmission" else lines
+        data = np.exp(-lines) if quantity == "unknown" else lines
         assert told(data, angles, quantity) == []
         missed += not told(data.swapaxes(0, 1), angles, quantity)
     assert missed == 0
@@ -59,9 +62,9 @@ def counts(seed: int, light: float, dtype: type) -> ArraySource:
 @pytest.mark.parametrize("light", [800.0, 3000.0, 20000.0])
 def test_counts_with_their_bytes_in_the_other_order(light: float, dtype: type) -> None:
     source = counts(1, light, dtype)
-    assert list(pixels_as_labelled(source)) == []  # type: ignore[arg-type]
-    swapped = ArraySource(source._data.byteswap(), [0] * N, source.angles)
-    (finding,) = pixels_as_labelled(swapped)  # type: ignore[arg-type]
+    assert list(pixels_as_labelled(source)) == []
+    swapped = ArraySource(source._data.byteswap(), [0] * N, source.table.angles)
+    (finding,) = pixels_as_labelled(swapped)
     assert finding.severity == "error"
     assert "byteswap" in finding.message
 
@@ -106,7 +109,7 @@ def test_a_scan_with_a_horizontal_axis_is_named_and_read(tmp_path: Path, quantit
     upright = replace(stated, horizontal_axis=True)
     assert not [f for f in validate(upright) if f.rule == "axis"]
     with open_scan(upright) as source:
-        views = np.flatnonzero(source.image_key == 0)
+        views = np.flatnonzero(source.table.kinds == 0)
         assert source.shape == (20, 40)
         np.testing.assert_array_equal(source.read(views, slice(3, 9)), frames[:, 3:9])
         if quantity == "counts":

@@ -96,13 +96,13 @@ def test_ends_of_passes_and_decisions_are_there_while_the_file_grows(
     with NXtomoWriter(path, replace(INFO, decides=True), SHAPE, clock=clock, flush_every=100) as writer:
         append(writer, *frames[:8])
         with open_scan(path, follow=True) as source:
-            assert (source.pass_ends.tolist(), source.decisions) == ([], ())
+            assert (source.table.pass_ends.tolist(), source.decisions) == ([], ())
             writer.end_pass()
-            assert (source.refresh(), source.pass_ends.tolist()) == (8, [8])
+            assert (source.refresh(), source.table.pass_ends.tolist()) == (8, [8])
             writer.add_decision(decided)
             append(writer, *frames[8:])
             writer.end_pass()
-            assert (source.refresh(), source.pass_ends.tolist()) == (len(frames), [8, len(frames)])
+            assert (source.refresh(), source.table.pass_ends.tolist()) == (len(frames), [8, len(frames)])
             assert source.decisions == (decided,)
 
 
@@ -177,7 +177,7 @@ def test_a_frame_that_was_taken_again_is_not_taken_for_damaged(
     first = replace(frames[-1], index=14, kind=kind)
     path = write([*frames, first, replace(first, index=15, replaces=14)])
     with open_scan(path) as source:
-        assert (source.altered, source.image_key[14:].tolist()) == (frozenset(), [FrameKind.INVALID, kind])
+        assert not source.table.altered.any() and source.table.kinds[14:].tolist() == [FrameKind.INVALID, kind]
 
 
 def test_an_alignment_frame_is_no_view_to_those_who_do_not_know_it(write: Write, frames: list[Frame]) -> None:
@@ -188,7 +188,7 @@ def test_an_alignment_frame_is_no_view_to_those_who_do_not_know_it(write: Write,
         assert file["exchange/data"].shape[0] == 9
         assert file["entry/instrument/detector/image_key_control"] == file["entry/frame_log/kind"]
     with open_scan(path) as source:
-        assert source.image_key[14] == FrameKind.ALIGNMENT
+        assert source.table.kinds[14] == FrameKind.ALIGNMENT
 
 
 @pytest.mark.parametrize("planned", [True, False])

@@ -58,7 +58,7 @@ def test_a_disk_that_takes_no_end_of_a_pass_is_named_and_the_frames_stay(
     writer.add_decision({"choice": "next"})  # nothing more is written
     writer.close()
     with open_scan(tmp_path / "s.h5") as source:
-        assert (source.refresh(), source.attributes["status"], source.pass_ends.size) == (3, "failed", 0)
+        assert (source.refresh(), source.attributes["status"], source.table.pass_ends.size) == (3, "failed", 0)
         assert source.decisions == ()
 
 
@@ -86,7 +86,7 @@ def test_after_a_full_disk_another_process_reads_what_was_committed(
     code = (
         "import sys; from beamline.storage.readers.open import open_scan\n"
         "with open_scan(sys.argv[1]) as s: "
-        "print(s.image_key.size, s.finished, s.attributes['status'], s.read([1]).sum())"
+        "print(len(s.table), s.finished, s.attributes['status'], s.read([1]).sum())"
     )
     said = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True).stdout
     assert said.split() == ["2", "True", "failed", str(frames[1].counts.sum())]
@@ -233,7 +233,7 @@ def test_rows_before_a_disk_that_takes_no_more_pixels_are_committed(
     with open_scan(tmp_path / "s.h5") as source:
         assert source.refresh() == 3
         assert all((source.read([i])[0] == frames[i].counts).all() for i in range(3))
-        assert source.angles[:3] == pytest.approx([frame.angle for frame in frames[:3]], nan_ok=True)
+        assert source.table.angles[:3] == pytest.approx([frame.angle for frame in frames[:3]], nan_ok=True)
 
 
 def _cut(path: Path) -> None:

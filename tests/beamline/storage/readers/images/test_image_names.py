@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from beamline.core.errors import DataError
+from beamline.features.files.validate import validate
 from beamline.storage.readers.images.image_names import _half_a_turn_on, kinds_of
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE, VIEWS = (4, 6), 12
@@ -77,11 +78,11 @@ def test_angles_in_names_go_with_their_frames_in_the_order_of_numbers(tmp_path: 
     facts = [{"whole": int(a), "thousandths": round(a % 1 * 1000), "degrees": a, "i": i} for i, a in enumerate(degrees)]
     _written(tmp_path, [pattern.format(**fact) for fact in facts])
     with open_scan(tmp_path) as source:
-        np.testing.assert_allclose(np.degrees(source.angles), degrees, atol=1e-9)
+        np.testing.assert_allclose(np.degrees(source.table.angles), degrees, atol=1e-9)
         assert source.read(range(VIEWS))[:, 0, 0].tolist() == list(range(VIEWS))
         assert source.attributes["angles_from"] == "the names of the files"
     with open_scan(SourceOptions(tmp_path, angles=np.radians(degrees[::-1]))) as source:  # those given go first
-        np.testing.assert_allclose(np.degrees(source.angles), degrees[::-1])
+        np.testing.assert_allclose(np.degrees(source.table.angles), degrees[::-1])
 
 
 @pytest.mark.parametrize(
@@ -116,8 +117,8 @@ def test_hidden_files_beside_images_are_no_images(tmp_path: Path) -> None:
     (tmp_path / "._angles.txt").write_bytes(b"\0\5\26\7")
     (tmp_path / "angles.txt").write_text("0\n1\n2\n")
     with open_scan(tmp_path) as source:
-        assert source.image_key.tolist() == [2, 2, 0, 0, 0]
-        np.testing.assert_allclose(np.degrees(source.angles[2:]), [0, 1, 2])
+        assert source.table.kinds.tolist() == [2, 2, 0, 0, 0]
+        np.testing.assert_allclose(np.degrees(source.table.angles[2:]), [0, 1, 2])
     assert len(load_images(tmp_path, DARK)) == 5
 
 
@@ -136,7 +137,7 @@ def test_references_named_after_the_views_come_after_them(tmp_path: Path, before
             image = np.full(SHAPE, number, np.uint16)
             tifffile.imwrite(tmp_path / folder / f"IMAT0002673{number}_bone_{folder}_{i:04d}.tif", image)
     with open_scan(tmp_path) as source:
-        assert source.image_key.tolist() == [2] * 3 + [1] * 2 + [0] * 12 + [1] * 2 + [3]
+        assert source.table.kinds.tolist() == [2] * 3 + [1] * 2 + [0] * 12 + [1] * 2 + [3]
         assert source.read(slice(None))[:, 0, 0].tolist() == [3] * 3 + [1] * 2 + [0] * 12 + [2] * 2 + [4]
         assert [field.value for field in source.not_used] == ["1 image"] and source.ending.missing == ()
 
@@ -150,16 +151,25 @@ def test_images_that_are_not_read_are_named_with_a_way(tmp_path: Path) -> None:
     for suffix, picture in (("jpg", np.zeros(SHAPE, np.uint8)), ("png", np.zeros((*SHAPE, 3), np.uint8))):
         (tmp_path / suffix).mkdir()
         Image.fromarray(picture).save(tmp_path / suffix / f"p_1.{suffix}")
-    np.savez(tmp_path / "s.npz", a=picture)
+    np.savez(tmp_path / "s.npz", a=picture, settings=np.array({"mode": "cone"}, object))
     (tmp_path / "s.pickle").write_bytes(b"cos\nsystem\n(S'exit 1'\ntR.")
     for name, message in {
-        "jpg": r"pictures such as p_1.jpg, .* 8 bits.*PIL.*\*\.jpg.* writes PNG",
+        "jpg": r"pictures such as p_1.jpg .* 8 bits.*PIL.*\*\.jpg.* writes PNG",
         "png": "its pixels are RGB, 6 x 4; expected grey ones",
-        "s.npz": "arrays saved by Python.*np.save",
+        "s.npz": "objects of Python among its arrays, which are pickles.*numpy.savez",
         "s.pickle": "is a pickle, which is never opened here.*np.save",
     }.items():
         with pytest.raises(DataError, match=message):
             open_scan(tmp_path / name)
+
+
+@pytest.mark.parametrize("quantity", ["counts", None])
+def test_folders_of_references_beside_the_views_are_named(tmp_path: Path, quantity: str | None) -> None:
+    for name in ("Tomo", "Flat_Before", "Dark_After"):
+        _written(tmp_path / name, [f"IMAT_{name}_{i}.tif" for i in range(4)])
+    found = validate(SourceOptions(tmp_path / "Tomo", angles=np.arange(4.0), quantity=quantity))  # type: ignore[arg-type]
+    said = " ".join(each.message for each in found if each.rule == "references")
+    assert f"Beside it lie Dark_After, Flat_Before: {tmp_path} is read with all of them" in said
 
 
 def test_other_images_beside_tiffs_are_no_frames(tmp_path: Path) -> None:
@@ -167,4 +177,4 @@ def test_other_images_beside_tiffs_are_no_frames(tmp_path: Path) -> None:
     np.save(tmp_path / "theta.npy", np.arange(4.0))
     Image.fromarray(np.zeros(SHAPE, np.uint8)).save(tmp_path / "preview.png")
     with open_scan(tmp_path) as source:
-        assert source.image_key.tolist() == [0] * 4
+        assert source.table.kinds.tolist() == [0] * 4

@@ -62,7 +62,7 @@ def test_a_scene_gives_the_volume_of_its_authors(tmp_path: Path) -> None:
         assert (source.quantity, source.cone, source.axis_col) == ("line_integrals", (DSO, DSD), (N - 1) / 2)
         assert source.pixel_size_mm == pytest.approx(PITCH)
         assert [field[:2] for field in source.not_used] == [("proj_test", "2 views")]
-        views, angles = source.read(slice(None)), source.angles
+        views, angles = source.read(slice(None)), source.table.angles
     geometry = Geometry.cone(angles, (N, N), sod=DSO, sdd=DSD, pixel_pitch=PITCH)
     ours = recon.reconstruct(views, geometry, "fbp").volume.data
     theirs = _volume().transpose(2, 0, 1)[::-1, ::-1]

@@ -15,7 +15,7 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE = (6, 8)
@@ -50,12 +50,12 @@ def test_a_folder_or_zip_explains_itself_by_names(series: tuple[Path, np.ndarray
     with open_scan(zipped(folder) if packed else folder) as source:
         assert (source.format, source.quantity) == ("tiff_series", "counts")
         assert (source.shape, source.dtype) == (SHAPE, np.uint16)
-        assert source.image_key.tolist() == [2, 1, 1, *[0] * 12]
+        assert source.table.kinds.tolist() == [2, 1, 1, *[0] * 12]
         np.testing.assert_array_equal(source.read(np.arange(3, 15)), images)  # 9 before 10
         np.testing.assert_array_equal(source.read([14, 3], slice(2, 5)), images[[11, 0], 2:5])
         assert source.read([2])[0, 0, 0] == 60001
-        np.testing.assert_allclose(source.angles[3:], np.radians(np.linspace(0, 165, 12)))
-        assert np.isnan(source.angles[:3]).all()
+        np.testing.assert_allclose(source.table.angles[3:], np.radians(np.linspace(0, 165, 12)))
+        assert np.isnan(source.table.angles[:3]).all()
         frame = list(source.frames())[13]
         assert (frame.kind, frame.index, frame.trigger) == (FrameKind.PROJECTION, 13, 10)
 
@@ -67,9 +67,9 @@ def test_angles_that_do_not_fit_are_refused_with_the_rows_that_would(series: tup
     with pytest.raises(DataError, match=r"19 angles.*--angle-rows 4:16 "):
         open_scan(folder)
     with open_scan(SourceOptions(folder, angle_rows="4:16")) as source:
-        np.testing.assert_allclose(source.angles[3:], np.radians(np.linspace(0, 165, 12)))
+        np.testing.assert_allclose(source.table.angles[3:], np.radians(np.linspace(0, 165, 12)))
     with open_scan(SourceOptions(folder, angles=folder / "angles.txt", angle_rows="4:16")) as source:
-        np.testing.assert_allclose(source.angles[3:], np.radians(np.linspace(0, 165, 12)))
+        np.testing.assert_allclose(source.table.angles[3:], np.radians(np.linspace(0, 165, 12)))
 
 
 def test_explicit_angles_and_references_win(series: tuple[Path, np.ndarray], tmp_path: Path) -> None:
@@ -78,8 +78,8 @@ def test_explicit_angles_and_references_win(series: tuple[Path, np.ndarray], tmp
     tifffile.imwrite(tmp_path / "dark_stack.tif", np.full((2, *SHAPE), 9, np.uint16), photometric="minisblack")
     angles = np.arange(12) * 0.1
     with open_scan(SourceOptions(folder, angles=angles, flats=flats, darks=tmp_path / "dark_stack.tif")) as source:
-        assert source.image_key.tolist() == [2, 2, 1, 1, 1, 3, 3, 3, *[0] * 12]
-        np.testing.assert_array_equal(source.angles[8:], angles)
+        assert source.table.kinds.tolist() == [2, 2, 1, 1, 1, 3, 3, 3, *[0] * 12]
+        np.testing.assert_array_equal(source.table.angles[8:], angles)
         assert source.read([0, 4])[:, 0, 0].tolist() == [9, 50000]
         np.testing.assert_array_equal(source.read([8])[0], images[0])
 
@@ -98,7 +98,7 @@ def test_numbers_that_are_dates_are_no_counts(tmp_path: Path) -> None:
         tifffile.imwrite(tmp_path / f"img_2026012{day}120000.tif", np.full(SHAPE, day, np.uint16))
     tracemalloc.start()
     with open_scan(tmp_path) as source:
-        assert source.image_key.size == 4
+        assert len(source.table) == 4
         assert "missing_numbers" not in source.attributes
     assert tracemalloc.get_traced_memory()[1] < 10e6  # every number between them took 8.6 GB for 24 files in a month
     tracemalloc.stop()
@@ -119,7 +119,7 @@ def test_a_gap_in_the_numbers_is_told_and_moves_no_angle(series: tuple[Path, np.
     for rows in (None, "0:12"):
         with open_scan(SourceOptions(folder, angle_rows=rows)) as source:
             assert source.attributes["missing_numbers"] == "5"
-            np.testing.assert_allclose(source.angles[3:], np.radians(np.linspace(0, 165, 12))[there])
+            np.testing.assert_allclose(source.table.angles[3:], np.radians(np.linspace(0, 165, 12))[there])
             np.testing.assert_array_equal(source.read(np.arange(3, 14)), images[there])
     assert any("leaves out the numbers 5" in finding.message for finding in validate(folder))
 
@@ -164,7 +164,7 @@ def test_a_stack_is_read_page_by_page(tmp_path: Path, rng: np.random.Generator, 
         np.testing.assert_array_equal(source.read(slice(None)), stack)
         np.testing.assert_array_equal(source.read([6, 0, 3], slice(1, 4)), stack[[6, 0, 3], 1:4])
         np.testing.assert_array_equal(source.read([2], slice(0, 6, 2)), stack[[2], 0:6:2])
-        np.testing.assert_array_equal(source.angles, np.arange(7.0))
+        np.testing.assert_array_equal(source.table.angles, np.arange(7.0))
 
 
 @pytest.mark.parametrize("compression", [None, "zlib"])
@@ -175,7 +175,7 @@ def test_pages_appended_one_at_a_time_are_one_stack(
     for page in stack:
         tifffile.imwrite(tmp_path / "s.tif", page, append=True, compression=compression, bigtiff=True)
     with open_scan(tmp_path / "s.tif") as source:
-        assert (source.shape, source.dtype, source.image_key.size) == (SHAPE, np.float32, 7)
+        assert (source.shape, source.dtype, len(source.table)) == (SHAPE, np.float32, 7)
         np.testing.assert_array_equal(source.read(slice(None)), stack)
         np.testing.assert_array_equal(source.read([6, 3], slice(1, 4)), stack[[6, 3], 1:4])
     np.testing.assert_array_equal(load_images(tmp_path / "s.tif", FrameKind.FLAT), stack)
@@ -214,8 +214,8 @@ def test_the_real_series_is_the_real_hdf5_scan(shared_data: Path) -> None:
         open_scan(SourceOptions(path, angle_rows="10:101")) as tiffs,
         open_scan(shared_data / "diamond_24737_parallel_91x135x160.h5") as exchange,
     ):
-        np.testing.assert_allclose(tiffs.angles, exchange.angles, atol=1e-9)
-        np.testing.assert_array_equal(tiffs.image_key, exchange.image_key)
+        np.testing.assert_allclose(tiffs.table.angles, exchange.table.angles, atol=1e-9)
+        np.testing.assert_array_equal(tiffs.table.kinds, exchange.table.kinds)
         np.testing.assert_array_equal(tiffs.read(slice(None)), exchange.read(slice(None)))
 
 

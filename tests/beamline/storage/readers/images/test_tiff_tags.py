@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
 
 SHAPE, N = (6, 8), 4
@@ -138,3 +138,9 @@ def test_pyramids_are_read_in_full_resolution(tmp_path: Path, stack: NDArray[np.
         with open_scan(tmp_path / place) as source:
             np.testing.assert_array_equal(source.read(slice(None)), stack)
             assert [field.where for field in source.not_used] == ["pages of other resolutions or masks"]
+
+
+def test_a_colour_image_is_no_stack(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "s.tif", np.zeros((5, 4, 3), np.uint8), photometric="rgb")
+    with pytest.raises(DataError, match="along YXS; expected one stack of grey images"):
+        open_scan(tmp_path / "s.tif")

@@ -12,7 +12,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.readers.replacements import load_images
+from beamline.storage.readers.reference_files import load_images
 from beamline.storage.readers.transforms import real_type
 from drivers.base.frame import FrameKind
 from tests.beamline.scans import TwoCylinders
@@ -36,7 +36,7 @@ def test_reals_are_read_as_such(tmp_path: Path, quantity: Any, kind: Any) -> Non
     with open_scan(SourceOptions(written(tmp_path / "s.tif", images), quantity=quantity)) as source:
         assert (source.dtype == kind, "pixels" in source.attributes) == (known, known)
         if known:
-            views = np.flatnonzero(source.image_key == FrameKind.PROJECTION)  # transmission has references in front
+            views = source.table.views  # transmission has references in front
             np.testing.assert_array_equal(source.read(views), images)
     if kind is not np.float16:
         np.testing.assert_array_equal(load_images(tmp_path / "s.tif", FrameKind.FLAT), images)

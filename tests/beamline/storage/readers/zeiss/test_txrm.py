@@ -72,14 +72,14 @@ def test_a_dark_of_zeros_then_the_reference_then_views(tmp_path: Path, dtype: st
     views = VIEWS.astype(dtype)
     with open_scan(write_compound(tmp_path / "s.txrm", streams(views))) as source:
         assert (source.format, source.quantity, source.finished) == ("txrm", "counts", True)
-        assert source.image_key.tolist() == [2, 1, *[0] * 120]
+        assert source.table.kinds.tolist() == [2, 1, *[0] * 120]
         assert source.pixel_size_mm == pytest.approx(0.0065)
         assert source.cone is None
         np.testing.assert_array_equal(source.read(slice(2, None)), views)
         np.testing.assert_array_equal(source.read([121, 102, 1, 0], slice(1, 3))[:2], views[[119, 100], 1:3])
         np.testing.assert_array_equal(source.read([0, 1])[:, 0, 0], [0, BEAM])
-        np.testing.assert_allclose(source.angles[2:], SCAN.angles, atol=1e-6)
-        assert source.exposures[1:].tolist() == [0.5] * 121
+        np.testing.assert_allclose(source.table.angles[2:], SCAN.angles, atol=1e-6)
+        assert source.table.exposures[1:].tolist() == [0.5] * 121
 
 
 def test_line_integrals_are_those_of_the_scan(tmp_path: Path) -> None:
@@ -109,15 +109,15 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
     path = write_compound(tmp_path / "s.txrm", streams(**none, ImageInfo__ImagesTaken=np.uint32(30)))
     with open_scan(path) as source:
         assert (source.quantity, source.pixel_size_mm) == ("unknown", None)
-        assert source.image_key.tolist() == [FrameKind.PROJECTION] * 30
+        assert source.table.kinds.tolist() == [FrameKind.PROJECTION] * 30
         assert source.ending == ScanEnding("stopped", reason="30 of 120 planned views were taken.")
-        assert np.isnan(source.exposures).all()
+        assert np.isnan(source.table.exposures).all()
     assert describe(path)["format"] == "txrm"
     lost = write_compound(tmp_path / "a.txrm", streams(ImageInfo__Angles=None))
     with pytest.raises(DataError, match="120 views"):
         open_scan(lost)
     with open_scan(SourceOptions(lost, angles=SCAN.angles)) as source:
-        np.testing.assert_array_equal(source.angles[2:], SCAN.angles)
+        np.testing.assert_array_equal(source.table.angles[2:], SCAN.angles)
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_shifts_that_bring_views_back_are_poses_unless_they_are_ignored(tmp_path
     np.testing.assert_allclose(displaced.geometry.shifts, np.stack([-back, 0 * back], axis=1))
     assert "120 poses" in said[0] and "4 px (columns)" in said[0]
     with open_scan(SourceOptions(path, flats=VIEWS[:1])) as source:
-        np.testing.assert_allclose(np.asarray(source.shifts), [[np.nan] * 2] * 3 + [[-each, 0] for each in back])
+        np.testing.assert_allclose(np.asarray(source.table.shifts), [[np.nan] * 2] * 3 + [[-each, 0] for each in back])
     ignored, said = prepare(path, selection.with_steps(PosesOfFile(read_poses("ignore"))))
     assert not ignored.geometry.shifts.any() and said == []
     with pytest.raises(ConfigError, match="--tilt and --poses both"):
@@ -158,7 +158,7 @@ def test_shifts_that_bring_views_back_are_poses_unless_they_are_ignored(tmp_path
     with pytest.raises(DataError, match=r"copy would not.*Nothing was written"):
         ingest(path, tmp_path / "copy.h5")
     with open_scan(write_compound(tmp_path / "z.txrm", streams(**{"Alignment__X-Shifts": 0 * back}))) as source:
-        assert source.shifts is None
+        assert source.table.shifts is None
 
 
 REAL = Path(__file__).parents[6] / "shared" / "data" / "fixtures" / "tomopy_chip_tomo.txrm"
@@ -168,7 +168,7 @@ REAL = Path(__file__).parents[6] / "shared" / "data" / "fixtures" / "tomopy_chip
 def test_views_of_a_real_file_are_displaced_as_it_says() -> None:
     """The sign: each view against the one before, by phase correlation; what is left is the turn of the sample."""
     with open_scan(REAL) as source:
-        stated, views = source.shifts, np.log(source.read(slice(None)))
+        stated, views = source.table.shifts, np.log(source.read(slice(None)))
         assert (source.quantity, source.cone, len(views)) == ("unknown", None, 7)
     window = np.outer(np.hanning(256), np.hanning(256))
     spectra = np.fft.fft2((gaussian_filter(views, (0, 2, 2)) - gaussian_filter(views, (0, 12, 12))) * window)

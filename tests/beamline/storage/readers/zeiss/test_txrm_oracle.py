@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from beamline.storage.readers.open import open_scan
-from drivers.base.frame import FrameKind
 from tests.beamline.storage.compound import write_compound
 from tests.beamline.storage.readers.zeiss.test_txrm import VIEWS, streams
 
@@ -19,11 +18,11 @@ theirs = pytest.importorskip("txrm2tiff.txrm")
 def test_images_angles_exposures_and_scale_are_those_of_txrm2tiff(tmp_path: Path, dtype: str) -> None:
     path = write_compound(tmp_path / "s.txrm", streams(VIEWS.astype(dtype)))
     with theirs.open_txrm(path, strict=True) as txrm, open_scan(path) as ours:
-        views = np.flatnonzero(ours.image_key == FrameKind.PROJECTION)
-        (flat,) = np.flatnonzero(ours.image_key == FrameKind.FLAT)
+        views = ours.table.views
+        (flat,) = ours.table.flats
         np.testing.assert_array_equal(ours.read(views), txrm.get_images())
         np.testing.assert_array_equal(ours.read([flat])[0], txrm.get_reference())
-        np.testing.assert_allclose(np.degrees(ours.angles[views]), txrm.image_info["Angles"], atol=1e-12)
-        assert ours.exposures[views].tolist() == txrm.exposures
-        assert ours.exposures[flat] == txrm.reference_exposure
+        np.testing.assert_allclose(np.degrees(ours.table.angles[views]), txrm.image_info["Angles"], atol=1e-12)
+        assert ours.table.exposures[views].tolist() == txrm.exposures
+        assert ours.table.exposures[flat] == txrm.reference_exposure
         assert ours.pixel_size_mm == pytest.approx(1e-3 * txrm.image_info["PixelSize"][0])  # µm

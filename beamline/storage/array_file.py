@@ -1,0 +1,158 @@
+"""Arrays that a Zarr, an .npy or an .npz has by their names, as an HDF5 file has datasets."""
+
+from __future__ import annotations
+
+import zipfile
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import require_regular
+from beamline.core.machine import free_memory
+from beamline.storage import hdf5
+from beamline.storage.packing import packing
+from beamline.storage.structure import require_npy
+
+METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of a Zarr
+
+
+def is_zarr(path: Path) -> bool:
+    """Whether a folder is a Zarr store, written by any program."""
+    return any((path / name).is_file() for name in METADATA)
+
+
+def zarr_library(path: Path) -> Any:
+    """The package zarr. DataError: it is not installed."""
+    try:
+        import zarr
+    except ImportError as error:
+        raise DataError(
+            f"{path}: a Zarr needs zarr, which cannot be loaded here ({error}): pip install splatline[zarr]."
+        ) from error
+    return zarr
+
+
+_MOST = 1000  # arrays and groups of a Zarr that are looked at
+
+
+class NamedArray:
+    """An array with what is asked of a dataset of HDF5: name, file, attrs, shape, dtype, chunks; values by slices."""
+
+    is_virtual = False
+
+    def __init__(self, array: Any, name: str, file: ArrayFile) -> None:
+        self.array, self.name, self.file, self.attrs = array, name, file, dict(getattr(array, "attrs", {}))
+        self.chunks: tuple[int, ...] | None = getattr(array, "chunks", None)
+        packed = None
+        if array.dtype.kind in "uif":
+            packed = packing(self.attrs, array.dtype, f"{name} in {file.filename}", by_cil=False)
+        self._values, self.dtype = (
+            packed or np.asarray,
+            np.result_type(array.dtype, np.float32) if packed else array.dtype,
+        )
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.array, name)
+
+    def __getitem__(self, part: Any) -> Any:
+        try:
+            return self._values(self.array[part])
+        except Exception as error:  # whatever the codecs of a Zarr raise for a damaged chunk
+            raise OSError(f"{type(error).__name__}: {error}") from error
+
+
+class ArrayFile(dict[str, NamedArray]):
+    """The arrays of a file by the paths of their names; "" is the only one of a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.filename, self.attrs, self.close = str(path), dict[str, Any](), lambda: None
+        if path.suffix.lower() in _NUMPY:
+            require_regular(path)
+            arrays = dict[str, Any](numpy_arrays(path, "r"))
+        else:
+            zarr, store = zarr_library(path), str(path)
+            if path.is_file():
+                store = zarr.storage.ZipStore(path, mode="r")
+                self.close = store.close
+            root = zarr.open(store=store, path=zarr_root(path) or "", mode="r")
+            members = [("", root)] if hasattr(root, "chunks") else islice(root.members(max_depth=None), _MOST)
+            arrays, self.attrs = {name: item for name, item in members if hasattr(item, "chunks")}, dict(root.attrs)
+        self.update({name: NamedArray(array, f"/{name}", self) for name, array in arrays.items()})
+
+    def __missing__(self, path: str) -> NamedArray:
+        name = path.strip("/")
+        if name not in self and (name or len(self) != 1):
+            raise KeyError(path)
+        return self.get(name) or next(iter(self.values()))
+
+
+def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz by their names, in memory, or that of an .npy as "".
+
+    Raises:
+        DataError: the memory does not hold them, or some are objects of Python.
+        ValueError, OSError, ...: a damaged file.
+    """
+    try:
+        with path.open("rb") as file:  # opened here, for numpy leaves a damaged archive open
+            if file.peek(1)[:1] == b"\x93":
+                require_npy(file)
+                return {"": np.load(path, mmap_mode=mapped, allow_pickle=False)}
+            with np.load(file, allow_pickle=False) as packed:
+                members = [each for each in packed.zip.infolist() if each.filename.endswith(".npy")]
+                require_room(path, sum(each.file_size for each in members))
+                return {name: packed[name] for name in (each.filename.removesuffix(".npy") for each in members)}
+    except ValueError as error:
+        if "bject" not in str(error):
+            raise
+        raise DataError(
+            f"{path} holds objects of Python among its arrays, which are pickles: these are never opened here, as one "
+            "may run any program. Save the arrays alone (numpy.save, numpy.savez). Nothing was read."
+        ) from error
+
+
+def require_room(path: Path, n: int) -> None:
+    """Raise DataError if n bytes exceed the free memory: a damaged file may claim any size."""
+    if n > (free := free_memory()):
+        raise DataError(
+            f"{path} cannot be read: it says that it holds {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are "
+            "free; cut the volume or bin it."
+        )
+
+
+def open_array_file(path: Path, follow: bool = False) -> Any:
+    """Open a file that has arrays by their names: HDF5, which may still grow, or `ArrayFile`."""
+    return ArrayFile(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
+
+
+_RUNS = (
+    "{0} is a pickle, which is never opened here: it may run any program that its writer put into it. If you trust the "
+    'writer, convert FILE (as NAF and SAX-NeRF have it): python -c "import numpy as np, pickle; d = pickle.load(open('
+    "'FILE', 'rb')); np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
+    'print({k: v for k, v in d.items() if np.size(v) < 9})". It prints DSO, DSD and dDetector in mm. Then: beamline '
+    "recon views.npy --angles angles.npy --angles-unit rad --quantity line-integrals --cone DSO:DSD --pixel-size-um "
+    "1000*dDetector. Nothing was read."
+)
+_PICKLES, _NUMPY = (".pickle", ".pkl", ".pck"), (".npy", ".npz")
+
+
+def holds_arrays(path: Path) -> bool:
+    """Whether a path is an .npy, an .npz or a Zarr. DataError: a pickle, whose arrays are read once converted."""
+    if path.is_file() and path.suffix.lower() in _PICKLES:
+        raise DataError(_RUNS.replace("{0}", str(path)))
+    return (path.suffix.lower() in _NUMPY and path.is_file()) or zarr_root(path) is not None
+
+
+def zarr_root(path: Path) -> str | None:
+    """Where in a folder or .zip a Zarr begins; None without one."""
+    if path.is_dir():
+        return "" if is_zarr(path) else None
+    if path.suffix.lower() != ".zip" or not path.is_file() or not zipfile.is_zipfile(path):
+        return None
+    with zipfile.ZipFile(path) as packed:
+        names = [name.rpartition("/") for name in packed.namelist()]
+    return min((folder for folder, _, name in names if name in METADATA), key=len, default=None)

@@ -1,0 +1,256 @@
+"""Angles from outside the scan file: read, and laid on frames only where they fit."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from contextlib import closing
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from beamline.core.errors import DataError
+from beamline.core.files import text_in
+from beamline.plan.plan import from_text
+from beamline.storage import datasets, hdf5
+from beamline.storage.array_file import holds_arrays, open_array_file
+from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.stacks import arrays_of, dataset_at, datasets_text, turned
+
+Angles = Path | str | ArrayLike
+"""A file, or FILE::NAME of a column or a dataset, in degrees unless it states a unit; or an array in radians."""
+_ANGLE = re.compile(r"angle|theta|rotation|omega|phi|degree|\bdeg\b|°", re.IGNORECASE)  # in the name of a column
+_UNIT = re.compile(r"[\[(]([^\])]+)[\])]$|[ _](deg|degrees?|m?rad|radians?)$", re.IGNORECASE)  # at its end
+_VALUE = re.compile(r"[-+]?(\.?\d|nan\b|inf\b)", re.IGNORECASE)  # what no name of a column begins with
+
+
+def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
+    """Radians from a file, or from an array in radians.
+
+    Args:
+        unit: "deg" or "rad", whatever the file says; None: as it says.
+
+    Raises:
+        DataError: they cannot be read, or several lists could be meant.
+    """
+    if not isinstance(angles, Path | str):
+        return np.atleast_1d(np.asarray(angles, np.float64))
+    name, _, where = (str(angles), "", "") if Path(angles).exists() else str(angles).partition("::")
+    path = Path(name)
+    if (arrays := holds_arrays(path)) or (path.is_file() and hdf5.is_hdf5(path)):
+        with hdf5.readable(path):
+            return angles_at(path, where.replace("\\", "/"), unit, "degrees" if arrays else "")
+    try:
+        return parse_angles(text_in(path), str(path), where, unit)
+    except OSError as error:
+        raise DataError(f"The angles in {path} cannot be read ({hdf5.reason(error)}).") from error
+
+
+def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> NDArray[np.float64]:
+    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy, a list or a column.
+
+    Args:
+        where: "": the only list whose unit is one of angles, or the only array.
+        unit: "deg" or "rad", whatever the file says; None: as it says, or `default` where it says none.
+
+    Raises:
+        DataError: it is not there, is no list, or nothing says its unit.
+    """
+    with closing(open_array_file(path)) as file, hdf5.readable(path):
+        if not where and isinstance(file, h5py.File):
+            where = _only_angles(file)
+        item = dataset_at(file, where)
+        if item.ndim == 0 or item.size != max(item.shape):
+            raise DataError(f"{item.name} in {path} has the shape {item.shape}; expected a list of angles.")
+        return turned(item, datasets.radians(item, unit, default), unit)
+
+
+def _only_angles(file: h5py.File) -> str:
+    """The path of the only list of a file whose unit is one of angles."""
+    names = [
+        str(item.name)
+        for item in arrays_of(file)
+        if item.ndim == 1 and datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)
+    ]
+    if len(names) != 1:
+        raise DataError(
+            f"{file.filename} has {len(names)} lists in a unit of angles. {datasets_text(file)} Name the right one: "
+            "--angles FILE::DATASET; where it states no unit, also --angles-unit deg or rad."
+        )
+    return names[0]
+
+
+def parse_angles(content: str, name: str, column: str = "", unit: str | None = None) -> NDArray[np.float64]:
+    """Radians from text in degrees (see `plan.from_text`), or from a column of a table, as `load_angles` has it.
+
+    Args:
+        name: where the text came from.
+    """
+    try:
+        text, stated = _column(content.splitlines(), column)
+        if (factor := datasets.factor_of(unit or stated, datasets.ANGLE_UNITS)) is None:
+            raise ValueError(f"the unit of its angles is {stated!r}; say --angles-unit deg or rad")
+        return from_text(text, unknown=True) * (factor / datasets.DEGREE)
+    except ValueError as error:
+        table = ". Of a table, FILE::COLUMN is one column: its name, or its number from 0" * (
+            "column" in str(error) or "its angle" in str(error)
+        )
+        raise DataError(f"{name}: {error}{table}.") from error
+
+
+def _column(lines: list[str], wanted: str) -> tuple[str, str]:
+    """The text of one column of a table, a line for each of the table, and its unit.
+
+    Args:
+        wanted: its name, or its number from 0 on; "": the only one that is named after angles. Names stand in the first
+            line, which may be a comment. A text without them is one list, in degrees.
+    """
+    filled = [number for number, line in enumerate(lines) if line.strip()] or [0]
+    head, last = (lines[filled[end]].strip() if lines else "" for end in (0, -1))
+    bare = head.lstrip("# ")
+    mark = next((mark for mark in (";", "\t", ",", None) if len(last.split(mark)) == len(bare.split(mark)) > 1), "\n")
+    names = [cell.strip(' "') for cell in bare.split(mark)]
+    titled = not any(map(_VALUE.match, names)) and (len(names) > 1 or (head == bare and bool(_ANGLE.search(bare))))
+    if not (titled or wanted):
+        return "\n".join(lines), "deg"
+    chosen = [n for n, title in enumerate(names) if titled and (title == wanted if wanted else _ANGLE.search(title))]
+    chosen = chosen or ([int(wanted)] if wanted.isdecimal() else [])
+    if len(chosen) != 1 or chosen[0] >= len(names):
+        held = ", ".join(names) if titled else f"{len(names)} without names"
+        raise ValueError(f"its columns are {held}; expected one that is named after angles")
+    for number, line in enumerate(lines):
+        cells = [] if line.lstrip()[:1] in ("", "#") or (titled and number == filled[0]) else line.split(mark)
+        lines[number] = (cells + [""] * len(names))[chosen[0]].strip(' "') or "(empty)" * bool(cells)
+    unit = _UNIT.search(names[chosen[0]]) if titled else None
+    return "\n".join(lines), (unit[1] or unit[2]).strip() if unit else "deg"
+
+
+def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
+    """Select rows "a:b" of the angles, counted from 0, b excluded; either may be left out."""
+    match = re.fullmatch(r"(\d*):(\d*)", rows.strip())
+    if match is None:
+        raise DataError(
+            f"--angle-rows {shlex.quote(rows)} is not of the form A:B, from 0 and B not included, such as 10:101."
+        )
+    first = int(match[1] or 0)
+    last = int(match[2] or angles.size)
+    if not 0 <= first < last <= angles.size:
+        raise DataError(f"--angle-rows {rows} is out of range: the file has {angles.size} angles.")
+    return angles[first:last]
+
+
+def assign(
+    source: ScanSource, angles: NDArray[np.float64], name: str, *, of_views: bool = False
+) -> NDArray[np.float64]:
+    """Assign an angle in radians to each frame of a source, NaN where unknown.
+
+    There is one angle for each projection; or one for each number of a series of files, where some are lost; or one for
+    each frame, where the order of all frames is known. A log that holds nan for each dark and flat tells it, too. A log
+    whose steps are equal from end to end has no rows of darks and flats, for which a stage stands.
+
+    Args:
+        name: where the angles come from, for messages.
+        of_views: the angles are those of projections alone.
+
+    Raises:
+        DataError: the angles fit none of these. It names the rows that are surely those of the projections, if any are.
+    """
+    projections, numbers = source.table.views, source.table.numbers
+    series = None if numbers is None else numbers[projections]
+    spread, all_frames = np.full(len(source.table), np.nan), angles.size == len(source.table) and not of_views
+    known = np.isfinite(angles)
+    if angles.size == projections.size:
+        spread[projections] = angles
+    elif numbers is not None and not of_views and _count_all(numbers, angles.size):
+        spread = angles[numbers - numbers.min()]
+    elif all_frames and source.in_order:
+        spread = angles
+    elif series is not None and _count_all(series, angles.size) and (not all_frames or _in_equal_steps(angles)):
+        spread[projections] = angles[series - series.min()]
+    elif all_frames and known.sum() == projections.size:
+        spread[projections] = angles[known]
+    else:
+        raise DataError(_misfit(source, angles, name, series))
+    return spread
+
+
+def _count_all(numbers: NDArray[np.int64], n: int) -> bool:
+    """Whether the numbers of files, no two of them the same, go from the first to the last of n."""
+    return bool(numbers.min() >= 0 and np.ptp(numbers) + 1 == n and np.unique(numbers).size == numbers.size)
+
+
+def _in_equal_steps(angles: NDArray[np.float64]) -> bool:
+    """Whether no step is half as long again, or half as short, as the typical one."""
+    steps = np.diff(angles)
+    typical = float(np.median(steps))
+    return bool((np.abs(steps - typical) < abs(typical) / 2).all())
+
+
+def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: NDArray[np.int64] | None) -> str:
+    n, frames = source.table.views.size, len(source.table)
+    if frames == 1 < angles.size:
+        return (
+            f"{name} has {angles.size} angles, and {source.path} holds one image of {source.shape[0]} x "
+            f"{source.shape[1]} pixels. As a sinogram it has as many rows, or columns, as views: give so many angles, "
+            "or say with --angle-rows A:B which of these are theirs (from 0, B not included)."
+        )
+    if angles.size < n:
+        message = f"{name} has {angles.size} angles for {n} projections, so that {n - angles.size} have none"
+    elif angles.size == frames:
+        message = (
+            f"{name} has {angles.size} angles, one for each frame, and {source.path} does not say when its darks and "
+            f"flats were taken"
+        )
+    else:
+        message = f"{name} has {angles.size} angles, but there are {n} projections among {frames} frames"
+    if series is not None and (gaps := source.attributes.get("missing_numbers")):
+        message += (
+            f". The numbers of the files go from {series.min()} to {series.max()} and leave out {gaps}: of "
+            f"{np.ptp(series) + 1} angles, one for each number, each image would get its own"
+        )
+    elif series is not None and n < angles.size != frames:
+        lost = angles.size - n
+        message += (
+            f". The numbers of the files go from {series.min()} to {series.max()} without a gap: of a series of "
+            f"{angles.size}, the first {lost} or the last {lost} may be lost"
+        )
+    if angles.size < n:
+        return f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order."
+    sinograms, window = "", evenly_spaced_window(angles, n)
+    if angles.size in source.shape:
+        order = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
+        sinograms = f"If each image is a sinogram of {angles.size} views, say --order {order}; if not, say"
+    message += (
+        f". {sinograms or 'Say'} with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
+    )
+    if window is None:
+        return f"{message}."
+    low, high = np.degrees(angles[list(window)])
+    return (
+        f"{message}; --angle-rows {window[0]}:{window[1] + 1} takes the {n} neighbours in the most equal steps, from "
+        f"{low:.4f} to {high:.4f} degrees."
+    )
+
+
+def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int] | None:
+    """First and last row of the n consecutive rows with the most equal steps; None if the choice is ambiguous.
+
+    A scan's angle log often holds the darks and flats as well, at a standing stage. If the steps go on beyond these
+    rows, other rows would do as well: then views were lost, and nothing tells which.
+    """
+    if n < 3 or angles.size <= n or not np.isfinite(angles).all():
+        return None
+    steps = np.diff(angles)
+    windows = np.lib.stride_tricks.sliding_window_view(steps, n - 1)
+    medians = np.median(windows, axis=1)
+    moving = np.flatnonzero(medians != 0)
+    if moving.size == 0:
+        return None
+    uneven = np.abs(windows - medians[:, None]).max(axis=1)[moving] / np.abs(medians[moving])
+    first = int(moving[np.argmin(uneven)])
+    beside = np.concatenate((steps[first - 1 : first] if first else [], steps[first + n - 1 : first + n]))
+    if (np.abs(beside - medians[first]) < np.abs(medians[first]) / 2).any():
+        return None
+    return first, first + n - 1

@@ -1,0 +1,234 @@
+"""Darks and flats from outside the scan file: an array, images, or a file of their own, as httomo and Savu have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from tifffile import natural_sorted
+
+from beamline.core.errors import DataError
+from beamline.storage import datasets, hdf5
+from beamline.storage.array_file import holds_arrays, open_array_file
+from beamline.storage.datasets import require_real
+from beamline.storage.frame_table import FrameTable
+from beamline.storage.readers.base import Quantity, ScanSource, Stated
+from beamline.storage.readers.dxchange import open_exchange
+from beamline.storage.readers.frames import Frames
+from beamline.storage.readers.nexus import find
+from beamline.storage.readers.nxtomo import open_nxtomo
+from beamline.storage.readers.orders import as_frames
+from beamline.storage.readers.stacks import FrameStack, StacksSource, dataset_at
+from beamline.storage.readers.tiff import (
+    DECODERS,
+    UNREADABLE,
+    images_among,
+    is_untyped,
+    no_image,
+    open_tiff,
+    read_image,
+)
+from beamline.storage.readers.transforms import real_type, type_wrapped, unsigned
+from drivers.base.frame import FrameKind
+
+Images = Path | str | NDArray[Any]
+"""A TIFF, a folder of images, an HDF5 file, .npy, .npz or Zarr (`FILE::DATASET` where it has several), an array
+[frame, row, col], or a whole number, the counts of every pixel, unless a file has it as its name."""
+
+
+def stated_references(
+    base: ScanSource, quantity: Stated | None, given: tuple[Images | None, Images | None], white: float | None
+) -> tuple[Images | None, Images | None]:
+    """The darks and flats that replace the scan's, of 0 and 1 for transmission; None: its own.
+
+    Args:
+        given: by the caller.
+        white: counts of the open beam by the maker's file.
+
+    Raises:
+        DataError: what is no transmission.
+    """
+    darks, flats = given
+    nothing = np.zeros((1, *base.shape), base.dtype)
+    if quantity != "transmission":
+        if white is None or base.dtype.kind not in "ui":
+            return given
+        flats = np.full_like(nothing, white) if flats is None else flats
+        return nothing if darks is None else darks, flats
+    if darks is not None or flats is not None:
+        raise DataError(
+            "--quantity transmission means that frames are already divided by flats: leave out --darks and --flats."
+        )
+    if base.dtype.kind != "f":
+        raise DataError(
+            f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
+            "stands for 1, give an image of it with --flats, one of 0 with --darks, and leave out --quantity."
+        )
+    return nothing, np.ones_like(nothing)
+
+
+_EXCHANGE = {FrameKind.DARK: "exchange/data_dark", FrameKind.FLAT: "exchange/data_white"}
+_LISTED = 8  # datasets that an error names
+
+
+def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None = None) -> NDArray[Any]:
+    """Read reference frames [frame, row, col] into memory.
+
+    In an HDF5 file they are the dataset that is named, or the frames of this kind by its image_key, or those of Data
+    Exchange, or the only images of this shape.
+
+    Args:
+        kind: DARK or FLAT.
+        shape: (rows, cols) of the scan's frames; None: any.
+
+    Raises:
+        DataError: they cannot be read, are no images, or several could be meant.
+    """
+    if not isinstance(images, Path | str):
+        return _stack(np.asarray(images), "The array of reference frames")
+    name, _, dataset = str(images).partition("::")
+    path = Path(name)
+    if name.isdecimal() and shape is not None and not path.exists():
+        return np.full((1, *shape), int(name), np.min_scalar_type(int(name)))
+    if holds_arrays(path):
+        with closing(open_array_file(path)) as arrays, hdf5.readable(path):
+            return _in_rows(_read(path, dataset_at(arrays, dataset)), shape)
+    if path.is_file() and hdf5.is_hdf5(path):
+        with hdf5.open_hdf5(path) as file, hdf5.readable(path):
+            return _in_rows(_of_hdf5(path, file, dataset.replace("\\", "/"), kind, shape), shape)
+    if dataset:
+        raise DataError(f"{path} is not an HDF5 file, so that it has no dataset {dataset}.")
+    return _in_rows(_of_images(path), shape)
+
+
+def _in_rows(images: NDArray[Any], shape: tuple[int, int] | None) -> NDArray[Any]:
+    """References of a detector of one row, [frame, col], as frames of one row."""
+    lines = shape is not None and len(images) == shape[0] == 1 < images.shape[1] and images.shape[2] == shape[1]
+    return images.swapaxes(0, 1) if lines else images
+
+
+def _of_images(path: Path) -> NDArray[Any]:
+    files = [path]
+    if path.is_dir():
+        names = [item.name for item in path.iterdir()]
+        files = [path / name for name in natural_sorted(images_among(names))]
+        if not files:
+            raise DataError(no_image(path, names))
+    try:
+        decoders = [DECODERS.get(file.suffix.lower(), read_image) for file in files]
+        if untyped := decoders[0] is read_image:
+            with open_tiff(files[0]) as tif:
+                untyped = is_untyped(tif)
+        parts = [decoder(file) for decoder, file in zip(decoders, files, strict=True)]
+        stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
+    except UNREADABLE as error:
+        wanted = "" if isinstance(error, OSError) and error.errno else " as images of one shape, nor as HDF5"
+        raise DataError(f"The reference frames in {path} cannot be read{wanted} ({hdf5.reason(error)}).") from error
+    return _stack(stack, str(path), untyped)
+
+
+def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: tuple[int, int] | None) -> NDArray[Any]:
+    if dataset:
+        return _read(path, dataset_at(file, dataset))
+    for places in find(file):
+        keys = np.ravel(datasets.values_of(places.image_key))
+        if (keys == kind).any():
+            return _of_scan(open_nxtomo(path, own_angles=False, data=str(places.data.name)), kind)
+    exchange = datasets.dataset(file, _EXCHANGE[kind])
+    if exchange is not None and datasets.dataset(file, "exchange/data") is not None:
+        return _of_scan(open_exchange(path, own_angles=False), kind)
+    if exchange is not None:
+        return _read(path, exchange)
+    candidates = [item for item in _images(file) if shape is None or item.shape[-2:] == shape]
+    if len(candidates) == 1:
+        return _read(path, candidates[0])
+    listed = (candidates or [*_images(file)])[:_LISTED]
+    shapes = ", ".join(f"{item.name} ({' x '.join(map(str, item.shape))})" for item in listed)
+    wanted = "images" if shape is None else f"images of {shape[0]} x {shape[1]} pixels"
+    option = f"--{kind.name.lower()}s"
+    if candidates:
+        raise DataError(f"{path} holds several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
+    raise DataError(f"{path} holds no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
+
+
+def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
+    """Frames of a kind as the reader of their format gives them, mirrored and turned as the file says."""
+    with source:
+        return _stack(source.read(source.table.of_kind(kind)), str(source.path))
+
+
+def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
+    """Every dataset that may be images, once, also behind links."""
+    return (item for item in datasets.arrays_in(file, (2, 3, 4)) if min(item.shape[-2:]) > 1)
+
+
+def _read(path: Path, item: Any) -> NDArray[Any]:
+    if lost := datasets.missing_links(item):
+        raise DataError(f"{path} draws {item.name} from {lost[0]}, which is not there or differs.")
+    frames = as_frames(item)
+    if frames.ndim != 3:
+        raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")
+    datasets.require_possible(frames)
+    out = np.empty(frames.shape, frames.dtype)
+    datasets.read_frames(frames, np.arange(len(frames)), slice(None), out)
+    return _stack(out, f"{item.name} in {path}")
+
+
+def _stack(images: NDArray[Any], name: str, untyped: bool = False) -> NDArray[Any]:
+    require_real(images.dtype, name)
+    if (dtype := real_type(images, False) if untyped else type_wrapped(images)) is not None:
+        images = unsigned(images, dtype)
+    return images[None] if images.ndim == 2 else images
+
+
+_REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
+
+
+def overlaid(
+    base: ScanSource,
+    *,
+    darks: NDArray[Any] | None = None,
+    flats: NDArray[Any] | None = None,
+    quantity: Quantity | None = None,
+) -> ScanSource:
+    """A scan with references in front: darks, flats, then the frames of `base`.
+
+    If darks (flats) are given, those of `base` become INVALID: they stay in place, unused. Added flats are valid for
+    all parts of the scan. All frames have one dtype, as of one camera.
+
+    Args:
+        darks, flats: [frame, row, col].
+
+    Raises:
+        DataError: shapes or counts do not fit.
+    """
+    given = {kind: images for kind, images in zip(_REFERENCES, (darks, flats), strict=True) if images is not None}
+    for kind, images in given.items():
+        if images.ndim != 3 or images.shape[1:] != base.shape or len(images) == 0:
+            raise DataError(
+                f"The --{kind.name.lower()}s are {images.shape}; expected [frame, row, col] with frames of "
+                f"{base.shape} as in {base.path}."
+            )
+    if base.quantity == "unknown" and base.table.has(*{*_REFERENCES} - {*given}):
+        quantity = quantity or "counts"
+    base = Frames(
+        base,
+        quantity=quantity or base.quantity,
+        table=lambda known: known.without(known.of_kind(*given)),
+    )
+    if not given:
+        return base
+    stacks = [FrameStack(kind, f"--{kind.name.lower()}s", images) for kind, images in given.items()]
+    front = StacksSource(base.path, ExitStack(), stacks, format=base.format, facts={})
+
+    def of_all_parts(table: FrameTable) -> FrameTable:
+        starts = np.where((table.part_starts > len(front.table)) & (flats is None), table.part_starts, 0)
+        return replace(table, part_starts=np.unique(starts))
+
+    return Frames(front, base, in_order=base.in_order, checksummed=base.checksummed, table=of_all_parts)
