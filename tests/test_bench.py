@@ -145,14 +145,9 @@ def test_monitor(monkeypatch: Patch, capsys: pytest.CaptureFixture[str]) -> None
 
 def test_published(monkeypatch: Patch, tmp_path: Path) -> None:
     one, tables = script("test_published"), script("test_published_tables")
-    small(
-        monkeypatch,
-        one,
-        cone=toy_case,
-        warm_up=lambda *_, **__: None,
-        PUBLISHED=one.R2Published(30),
-        TOWARDS={"toy": FEW},
-    )
+    for each in (one, tables):
+        small(monkeypatch, each, cone=toy_case, warm_up=lambda *_, **__: None)
+    small(monkeypatch, one, PUBLISHED=one.R2Published(30), TOWARDS={"toy": FEW})
     monkeypatch.setenv("CURVE_SECONDS", "0.5")
     monkeypatch.setenv("CURVE_STEPS", "4")
     one.test_what_a_setting_costs(tmp_path, "toy", "toy")

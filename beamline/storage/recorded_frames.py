@@ -123,6 +123,7 @@ def _record(file: h5py.File, n: int) -> dict[str, NDArray[Any]]:
 
 def _column(file: h5py.File, path: str, n: int) -> NDArray[Any]:
     column, dtype = file[path], layout.COLUMNS.get(path, ("<f8", ""))[0]
+    datasets.require_real(column.dtype, f"{path} in {file.filename}")
     if len(column) < n:  # a reader has some of them open already, see look_again
         hdf5.look_again(column)
     values = np.asarray(column[:n])

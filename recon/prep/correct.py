@@ -279,9 +279,11 @@ class Correction:
             view[low] = settings.floor
             np.negative(np.log(view, out=view), out=view)
         live = max(int((~self.masked).sum()) * len(views.data), 1)
-        lines, replaced = (views.data, views.view_ids, floored / live), int(views.repaired.sum()) / live
-        found = self.masked, columns, replaced, views.beam, views.unmeasured, self.spots.left
-        return Projections(*lines, views.air, *found)
+        replaced, left = int(views.repaired.sum()) / live, self.spots.left
+        return Projections(
+            views.data, views.view_ids, floored / live, views.air, self.masked, columns, replaced, views.beam,
+            views.unmeasured, left,
+        )  # fmt: skip
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""

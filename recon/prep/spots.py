@@ -127,11 +127,11 @@ def without_spots(frames: Iterable[NDArray[Any]], light: float) -> Iterator[tupl
     here = next(left, None)
     while here is not None:
         after = next(left, None)
-        roots = [None if each is None else _root_of(each, light) for each in (before, after)]
         n, beside = 0, [each for each in (before, after) if each is not None]
         if beside:
-            found, _ = spots(_root_of(here, light), *roots, _OF_REFERENCES, still=True)
-            if n := np.count_nonzero(found):
+            first, second = (None if each is None else _root_of(each, light) for each in (before, after))
+            found, _ = spots(_root_of(here, light), first, second, _OF_REFERENCES, still=True)
+            if n := int(np.count_nonzero(found)):
                 here = np.where(found, np.mean(beside, axis=0), here)
         yield here, n
         before, here = here, after

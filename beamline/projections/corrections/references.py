@@ -73,7 +73,8 @@ class _Reading:
 
     def mean(self, frames: NDArray[np.int64], weights: NDArray[np.float64] | None = None) -> NDArray[np.float64] | None:
         """Mean of the frames that may be used, each times its weight [frame of the scan]; None where none may."""
-        total, n = 0.0, 0
+        total: NDArray[np.float64] | float = 0.0
+        n = 0
         for frame, image in self.images(frames):
             total = total + (image if weights is None else weights[frame] * image).astype(np.float64)
             n += 1

@@ -139,7 +139,7 @@ def test_spots_of_flats_and_darks_are_not_in_their_mean(frames: int, level: floa
     assert found == (4, *[0] * (frames - 2), 1)
     assert np.abs(np.mean(images, axis=0) - clean.mean(axis=0)).max() < 6 * np.sqrt(1.2 * level / frames)
     flat = np.full((20, 30), light, np.float32)
-    made = References(spotted, ((0.0, flat),)).dark
+    made = References(spotted.astype(np.float32), ((0.0, flat),)).dark
     np.testing.assert_allclose(made, np.mean(images, axis=0), rtol=1e-6)
 
 

@@ -66,7 +66,9 @@ def test_validate_says_that_numbers_wrapped_and_nothing_of_the_light(dtype: type
     """With a sign, 65,536 and more is again above 0, beside darker matter far below 0 without any step."""
     views, flats = counts(light, 0.1).repeat(6, axis=0), np.random.default_rng(5).poisson(light, (3, 32, 256)) + 400
     darks = np.random.default_rng(6).normal(400, 3, (3, 32, 256)).round()
-    parts = [part.astype(np.int64).astype(np.uint16).view(dtype) for part in (darks, flats, views)]
-    source = scan_of(*parts, np.linspace(0, np.pi, 12, endpoint=False), dtype)
+    dark, flat, view = (
+        np.asarray(part.astype(np.int64).astype(np.uint16).view(dtype)) for part in (darks, flats, views)
+    )
+    source = scan_of(dark, flat, view, np.linspace(0, np.pi, 12, endpoint=False), dtype)
     found = source_findings(cast(ScanSource, source))
     assert [finding.rule for finding in found if finding.severity != "info"] == ["wrapped-numbers"]
