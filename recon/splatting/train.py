@@ -43,7 +43,7 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
-from recon.voxels.held_out import residuals_of
+from recon.voxels.residuals import residuals_of
 
 _TIMED = 3  # steps after which a fit's seconds are planned
 _LOOK = 50  # steps between two measurements of the views held out

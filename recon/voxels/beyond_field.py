@@ -32,9 +32,10 @@ from recon.voxels.field_edges import (
     taller_than_field,
     wider_than_field,
 )
-from recon.voxels.held_out import LEAST_VIEWS, residuals_of
+from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
+from recon.voxels.residuals import residuals_of
 
 _COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16  # of a trial: columns and rows after binning, views, iterations
 _LOOKS = 8  # views by which rows are chosen

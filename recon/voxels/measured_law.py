@@ -30,10 +30,10 @@ from recon.voxels.beyond_field import offset_error, sample_radius
 from recon.voxels.choice import preferred_strength
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
-from recon.voxels.held_out import unseen_residuals
 from recon.voxels.iterative import IterativeMethod, solve
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector, projection_lines
+from recon.voxels.residuals import unseen_residuals
 from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.voxel_problem import VoxelProblem
 

@@ -11,6 +11,7 @@ import recon
 from recon import methods
 from recon.auto import Auto
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.odd_views import odd_views
 from recon.voxels.projector import Projector, seen_rays
@@ -117,6 +118,6 @@ def test_a_view_that_differs_is_found_among_leaning_ones(cone: bool, rng: np.ran
     geometry = leaning(cone)
     data = rays(geometry) + rng.normal(0, 0.003, (32, 32, 38)).astype(np.float32)
     truth = recon.Volume(smooth_ball(GRID, AXES, CENTRE), GRID)
-    assert odd_views(truth, data, geometry, None) == ()
+    assert odd_views(truth, Views(data, geometry)) == ()
     data[11, 10:20, 14:24] += 0.1
-    assert [odd.view for odd in odd_views(truth, data, geometry, None)] == [11]
+    assert [odd.view for odd in odd_views(truth, Views(data, geometry))] == [11]

@@ -20,10 +20,11 @@ from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
 from recon.voxels.choice import BestStrength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, slab_of
-from recon.voxels.held_out import LEAST_VIEWS, unseen_residuals
+from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.iterative import solve
 from recon.voxels.priors import pnp_dct
 from recon.voxels.projector import Projector
+from recon.voxels.residuals import unseen_residuals
 from recon.voxels.resolution import ViewResolution
 from recon.voxels.trial import Trial, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
