@@ -336,11 +336,14 @@ class ScanCorrection:
             self._shadow = np.zeros(lines.shape[1:], np.bool_), foreign
 
     def _by_angle(self, frames: NDArray[np.int64]) -> NDArray[np.intp]:
-        """The order of frames in which neighbours are beside each other: as taken, unless that skips angles."""
-        angles = self._source.table.angles[frames]
+        """The order of frames in which neighbours are beside each other: as taken, unless that skips angles or has the
+        sample aside in some, which then come together.
+        """
+        angles, aside = self._source.table.angles[frames], self._source.table.aside
+        places = np.zeros(frames.size) if aside is None else np.nan_to_num(aside[frames])
         steps = np.diff(np.unwrap(angles))
-        in_time = (steps >= 0).all() or (steps <= 0).all()
-        return np.arange(frames.size) if in_time else np.argsort(angles, kind="stable")
+        in_time = ((steps >= 0).all() or (steps <= 0).all()) and not np.diff(places).any()
+        return np.arange(frames.size) if in_time else np.lexsort((angles, places))
 
     def _correction(self, rows: slice | None) -> Correction | LineIntegralCorrection:
         if self._beam is None:

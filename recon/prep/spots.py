@@ -235,5 +235,5 @@ def _mark(  # type: ignore[no-untyped-def]
                         differences[n] = abs(before[i, j] - against[i, j])
                         n += 1
                 found[r, c] = height > errors * np.median(differences[:n])
-            left += stray and not found[r, c]
+            left += stray and height <= limit
     return left

@@ -157,3 +157,16 @@ def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
     np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
     assert correction.done["flats"].sentence.startswith("Exposures of the views: 0.1")
     assert not list(references_usable(source))
+
+
+def test_spots_are_sought_beside_views_with_the_sample_at_the_same_place(rng: np.random.Generator) -> None:
+    """By their angles wide views are between others, which show the sample elsewhere."""
+    views, angles = SCAN.counts()[2:], SCAN.angles
+    wide = np.full_like(views[::3], DARK + BEAM)
+    views[rng.random(views.shape) < 1e-3] += np.uint16(BEAM // 10)
+    source = counted(np.concatenate([views, wide]), np.r_[angles, angles[::3]])
+    source.state(aside=np.r_[np.zeros(2 + len(views)), np.full(len(wide), 0.5)])
+    both = correction_of(source, PLAIN, lambda sentence: None).at_once(np.arange(2, len(source.table)))
+    alone = correction_of(counted(views, angles), PLAIN, lambda sentence: None).at_once(np.arange(2, 2 + len(views)))
+    assert alone.replaced > 0
+    np.testing.assert_array_equal(both.data[: len(views) - 1], alone.data[:-1])  # the last is beside a wide one

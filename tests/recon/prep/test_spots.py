@@ -114,6 +114,17 @@ def test_spots_that_are_too_large_are_counted(size: int, left: int) -> None:
     assert spots.left == left
 
 
+def test_a_bright_pixel_that_may_be_a_rim_of_few_views_is_no_large_spot() -> None:
+    views, spots = np.ones((VIEWS, ROWS, COLS), np.float32), SpotFilter(8.0, np.sqrt)
+    views[4, :, 20:40], views[6, :, 20:40] = 0.5, 0.8  # the views beside it differ by much
+    views[5, 12, 30] = 1.5
+    views[8, 12, 30] = 1.5
+    ids = np.arange(VIEWS)
+    found = spots.feed(Transmission(views, ids, np.zeros(VIEWS, int), np.ones(VIEWS, np.float32)))
+    assert np.flatnonzero(found.repaired).tolist() == [8]
+    assert spots.left == 0
+
+
 def test_neighbours_of_interlaced_views_are_those_by_angle() -> None:
     views = light(90)
     views[np.random.default_rng(4).random(views.shape) < 0.01] += 0.5
