@@ -41,19 +41,21 @@ def noise_level(images: F32) -> float:
     tests/recon/base/test_noise.py. Fine texture in almost noiseless views counts as noise.
 
     Args:
-        images: [view, a, b], line integrals; an axis shorter than five pixels is not used. Some 16 views are read.
+        images: [view, a, b], line integrals; NaN: does not count. An axis is not used along which fewer than five
+            pixels in succession count. Some 16 views are read.
 
     Returns:
-        The standard deviation; 0 if both axes are too short.
+        The standard deviation; 0 if no axis is used.
     """
-    some, axes = images[:: max(1, len(images) // NOISE_VIEWS)][:NOISE_VIEWS], len(_long_axes(images))
-    low, high = _differences(some, _LOW), _differences(some, _HIGH)
+    some = images[:: max(1, len(images) // NOISE_VIEWS)][:NOISE_VIEWS]
+    axes = _long_axes(some)
+    low, high = _differences(some, axes, _LOW), _differences(some, axes, _HIGH)
     if low == 0:
         return 0.0
     ratios, gains = _blurs()
     by_chance = 2 / math.sqrt(some.size)  # white noise has a ratio of 1 give or take this
-    at = int(np.searchsorted(-ratios, -min((high / low + by_chance) ** (2 / axes), 1.0)))
-    return low * float(gains[min(at, gains.size - 1)]) ** (axes / 2)
+    at = int(np.searchsorted(-ratios, -min((high / low + by_chance) ** (2 / len(axes)), 1.0)))
+    return low * float(gains[min(at, gains.size - 1)]) ** (len(axes) / 2)
 
 
 def deviation_between_neighbours(values: NDArray[np.floating[Any]], order: int = 1, axis: int = -1) -> float:
@@ -248,12 +250,18 @@ def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) ->
 
 
 def _long_axes(images: F32) -> list[int]:
-    return [axis for axis in (1, 2) if images.shape[axis] > _HIGH]
+    """Axes along which five pixels that count are beside each other, also after differences along the one before."""
+    field, axes = images, list[int]()
+    for axis in (1, 2):
+        further = np.diff(field, _HIGH, axis=axis)
+        if np.isfinite(further).any():
+            field = further
+            axes.append(axis)
+    return axes
 
 
-def _differences(images: F32, order: int) -> float:
+def _differences(images: F32, axes: list[int], order: int) -> float:
     """Standard deviation of white noise with the same differences of this order; NaN marks pixels that do not count."""
-    axes = _long_axes(images)
     if not axes:
         return 0.0
     field: NDArray[np.floating[Any]] = images

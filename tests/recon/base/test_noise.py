@@ -84,6 +84,16 @@ def test_pixels_that_do_not_count_are_nan(rng: np.random.Generator) -> None:
     assert median_deviation(np.full((1, 1, 3), np.nan, np.float32)) == 0.0
 
 
+@pytest.mark.parametrize("lost", [[4], [2, 4], [1, 3, 5, 7]])
+def test_few_rows_of_which_some_do_not_count_are_judged_along_their_columns(
+    lost: list[int], rng: np.random.Generator
+) -> None:
+    images = rng.normal(0, 0.01, (26, 8, 44)).astype(np.float32)
+    images[:, lost] = np.nan
+    assert noise_level(images) == pytest.approx(0.01, rel=0.15)
+    assert noise_level(images.swapaxes(1, 2)) == pytest.approx(0.01, rel=0.15)
+
+
 def test_what_stays_in_a_pixel_over_all_views_is_a_ring_and_what_moves_is_not(rng: np.random.Generator) -> None:
     rings = np.zeros((6, 50), np.float32)
     rings[:, 12], rings[2, 30] = 0.5, -0.4
