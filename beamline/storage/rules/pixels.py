@@ -70,6 +70,12 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
     )
 
 
+def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
+    """Numbers are of the type that the file states."""
+    if wrapped := source.attributes.get("pixels"):
+        yield Finding("warning", "pixels", f"The label of the pixels is wrong or missing: they are {wrapped}.")
+
+
 def quantity_stated(source: ScanSource) -> Iterator[Finding]:
     """The quantity of the pixels is known: a missing or a second logarithm ruins a volume unnoticed."""
     if source.quantity == "unknown":
