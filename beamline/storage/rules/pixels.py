@@ -14,7 +14,7 @@ from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.transforms import WRAPPED, wrapped_edges
 from beamline.storage.rules import Finding
 from drivers.base.frame import FrameKind
-from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
+from recon.base.units import look_like_counts, look_like_transmission
 from recon.base.views import spread
 
 CONSTANT_DARKS = "constant-darks"  # a rule whose finding is no fault, but which `info` shows
@@ -24,19 +24,6 @@ SHAPES = 32  # views whose shape is looked at
 _FALLS = (
     "The values are about 1 at the edges of the views and fall where the sample is, as transmission does; line "
     "integrals are 0 there and rise. Say --quantity transmission: its logarithm is then taken."
-)
-_DIMS = (
-    "The values are far above 1 at the edges of the views and fall where the sample is, as counts do; line integrals "
-    "are 0 there and rise. Say --quantity counts, with --darks and --flats; or divide them by the light without a "
-    "sample, and say --quantity transmission."
-)
-_NEGATIVE = (
-    "The values are 0 at the edges of the views and below 0 where the sample is, as the logarithm of transmission is; "
-    "line integrals are its negative, and rise there. Write them with the other sign."
-)
-_RISES = (
-    "The frames are divided by flats of 1, but they are 0 at the edges of the views and rise where the sample is, as "
-    "line integrals do; transmission is 1 there and falls. Say --quantity line-integrals, without --darks and --flats."
 )
 
 
@@ -118,8 +105,8 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             "pixels",
             f"{1 - finite.mean():.3%} of the pixels looked at are NaN, infinite or beyond {LARGEST:g}.",
         )
-    if source.quantity == "line_integrals" and (problem := _not_line_integrals(source)):
-        yield Finding("error", "quantity", problem)
+    if source.quantity == "line_integrals" and _falls(source):
+        yield Finding("error", "quantity", f"Transmission is given as line integrals. {_FALLS}")
     elif source.quantity == "line_integrals" and look_like_counts(views):
         yield Finding(
             "warning",
@@ -127,35 +114,12 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             f"The line integrals have a median of {np.nanmedian(views):.4g}, which no light passes: are they counts? "
             "If so, say --quantity counts, with darks and flats.",
         )
-    elif source.quantity == "counts" and _rises(source):
-        yield Finding("error", "quantity", _RISES)
 
 
 def _falls(source: ScanSource) -> bool:
     """The views look like transmission, which real numbers can be."""
     views = sample(source, FrameKind.PROJECTION, SHAPES) if source.dtype.kind == "f" else None
     return views is not None and look_like_transmission(views)
-
-
-def _not_line_integrals(source: ScanSource) -> str:
-    """What the values are that are given as line integrals; "": they may be."""
-    views = sample(source, FrameKind.PROJECTION, SHAPES)
-    if views is None:
-        return ""
-    if source.dtype.kind == "f" and look_like_transmission(views):
-        return f"Transmission is given as line integrals. {_FALLS}"
-    if look_like_light(views):
-        return f"Light is given as line integrals. {_DIMS}"
-    return _NEGATIVE if look_negative(views) else ""
-
-
-def _rises(source: ScanSource) -> bool:
-    """The views look like line integrals, though they are to be divided by a beam of about 1."""
-    flats = sample(source, FrameKind.FLAT) if source.dtype.kind == "f" else None
-    if flats is None or not 0.5 < np.nanmedian(flats) < 2:
-        return False
-    views = sample(source, FrameKind.PROJECTION, SHAPES)
-    return views is not None and look_like_transmission(np.exp(-np.maximum(views, -1)))
 
 
 def sample(source: ScanSource, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:
