@@ -29,9 +29,6 @@ _FALLS = (
 
 def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
     """Whole numbers stay within their type: what is brighter than its largest begins again at 0."""
-    if WRAPPED in source.attributes:
-        yield Finding("warning", WRAPPED, str(source.attributes[WRAPPED]))
-        return
     kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if source.dtype.itemsize == 2 else ()
     samples = {kind: images for kind in kinds if (images := sample(source, kind)) is not None}
     frames, flats = samples.values(), samples.get(FrameKind.FLAT)
@@ -40,7 +37,7 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
     below = _SURELY_BELOW * np.iinfo(np.int16).min if signed else -np.inf
     dark_too = FrameKind.DARK in samples and samples[FrameKind.DARK].min() < below
     low = 0 if dark_too else sum(int((images < below).sum()) for images in frames)
-    edges = sum(wrapped_edges(images, source.dtype, flat)[0] for images in frames)
+    edges = sum(wrapped_edges(images, source.dtype, flat) for images in frames)
     if not edges and low <= _FEW * sum(images.size for images in frames):
         return
     least, most = np.iinfo(source.dtype).min, np.iinfo(source.dtype).max
@@ -51,9 +48,9 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
         "error",
         WRAPPED,
         f"Numbers wrapped: in {sum(map(len, frames))} frames looked at, {what}, as 16-bit whole numbers do that went "
-        f"beyond {most} and began again at {least}, such as sums of pixels or frames. How bright these pixels were is "
-        "lost, and other references do not help. Make the frames again from those of the camera, as 32-bit or real "
-        "numbers.",
+        f"beyond {most} and began again at {least}, such as sums of pixels or frames, or below {least} where a dark "
+        "was subtracted. How bright these pixels were is lost, and other references do not help. Make the frames again "
+        "from those of the camera, as 32-bit or real numbers.",
     )
 
 

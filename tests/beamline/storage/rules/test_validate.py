@@ -189,8 +189,7 @@ DEGREES = np.arange(0, 180, 2.0)
         (np.radians(DEGREES), "span only 3.107 degrees: these look like radians: half a turn is 3.1416"),
         (np.radians(2 * DEGREES), "radians: a turn is 6.2832"),
         (np.radians(np.linspace(-90, 90, 9)), "radians: half a turn is 3.1416"),
-        (DEGREES / 360, "span only 0.4944 degrees: these look like turns: half a turn is 0.5"),
-        (DEGREES / 180, "turns: a turn is 1"),
+        (DEGREES / 360, "span only 0.4944 degrees: these look like radians or turns"),
         (np.radians(DEGREES) * 0.7, "these look like radians or turns"),
     ],
 )
