@@ -1,10 +1,8 @@
-"""Runner: reads the scan once, runs each trial in a separate process within the time limit, writes the table."""
+"""Runner: reads the scan once, runs each trial in a separate process, writes the table."""
 
 from __future__ import annotations
 
-import math
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -14,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, TrialReached
 from beamline.core.files import refuse_existing, refuse_not_utf8
 from beamline.core.machine import machine
-from beamline.core.process import ProcessEnd, json_object, run_to_end
+from beamline.core.process import json_object, run_to_end
 from beamline.core.recon_events import TrialDone
 from beamline.core.sinks import Warn, Warnings
 from beamline.features.trials.table import write_page, write_table
@@ -40,7 +39,6 @@ from recon.methods import by_name
 
 COMMAND = (sys.executable, "-m", "beamline.features.trials.worker")
 _HELD_OUT_VIEWS = 16  # at most
-_PAGES = 5.0, 0.1  # s of the budget for pictures and page at its end; share of it, at most
 
 
 @dataclass(frozen=True)
@@ -52,8 +50,6 @@ class ComparedScan:
         methods: names in `recon.methods`; none: those that suit the comparison.
         truth: FILE or FILE:first:end to compare with.
         seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
-        max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
-            what remains is not begun, a running one is ended. None: no limit.
         command: that repeats this, for the record.
     """
 
@@ -63,7 +59,6 @@ class ComparedScan:
     methods: Sequence[str] = ()
     truth: str | None = None
     seconds: float | None = None
-    max_seconds: float | None = None
     seed: int = 0
     command: str = ""
 
@@ -118,12 +113,11 @@ def opened_scan(
     return TrialData(prepared, truth), table
 
 
-def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf, *, keep: bool = False) -> Outcome:
+def run_trial(trial: Trial, work: Path, seed: int, *, keep: bool = False) -> Outcome:
     """Run one trial in a separate process, which has ended when this returns or raises.
 
     Args:
         work: a folder with the data, `DATA`.
-        max_seconds: after which the process is killed.
         keep: its volume [z, y, x] is written to the file `VOLUME` of the folder.
 
     Raises:
@@ -136,11 +130,9 @@ def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf
         event = json_object(line) or event
 
     TrialJob(trial, seed, keep).save(work)
-    ending, code, reason = run_to_end([*COMMAND, str(work)], work / "stderr.txt", on_line, seconds=max_seconds)
+    _, code, reason = run_to_end([*COMMAND, str(work)], work / "stderr.txt", on_line)
     if event.pop("event", None) == "result":
         return Outcome(trial, "done", **event)
-    if ending is ProcessEnd.OUT_OF_TIME:
-        return Outcome(trial, "out of time", message="ended: the time given with --max-seconds was over")
     message = event.get("message", f"its process ended with code {code}" + (f": {reason}" if reason else ""))
     if code == DataError.exit_code:
         raise DataError(message)
@@ -153,22 +145,20 @@ class _Run:
 
     Attributes:
         work: folder with the data.
-        end: by `now`, when the last trial must be done; inf: no limit.
         slices: gets those that the page shows.
     """
 
     work: Path
     folder: Path
     seed: int
-    end: float
-    now: Callable[[], float]
+    clock: Clock
     emit: Callable[[Event], None]
     slices: SliceSheet
 
     def run(self, trial: Trial) -> tuple[Outcome, F32 | None]:
-        """The outcome within the time that remains, and the volume [z, y, x] of a trial that the page shows."""
+        """The outcome, and the volume [z, y, x] of a trial that the page shows."""
         path, shown = self.work / VOLUME, trial.group == "method"
-        outcome = run_trial(trial, self.work, self.seed, self.end - self.now(), keep=shown)
+        outcome = run_trial(trial, self.work, self.seed, keep=shown)
         if not path.exists():
             return outcome, None
         volume: F32 = np.load(path)
@@ -185,22 +175,14 @@ class _Run:
         Raises:
             KeyboardInterrupt: before any trial was done; nothing was written.
         """
-        begin, todo, walls = self.now(), table.todo, dict[str, list[float]]()
+        begin, todo = self.clock.now(), table.todo
         try:
             for n, index in enumerate(todo):
-                trial, started, whole = table.outcomes[index].trial, self.now(), table
-                expected, left = _mean(walls.get(trial.method, [])) or 0.0, self.end - started
-                if left <= expected:
-                    refusal = f"not begun: it would take about {expected:.0f} s, and {max(left, 0.0):.0f} s were left"
-                    table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
-                    continue
-                each = _mean([wall for some in walls.values() for wall in some])
-                eta = None if each is None else min(each * (len(todo) - n), left)
-                rate = 60 * n / max(started - begin, 1e-9)
+                trial, whole, spent = table.outcomes[index].trial, table, self.clock.now() - begin
+                eta, rate = seconds_left(n, len(todo), spent), 60 * n / max(spent, 1e-9)
                 self.emit(TrialReached(table.name, n, len(todo), trial.label, eta, rate))
                 table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
                 outcome, _ = self.run(trial)
-                walls.setdefault(trial.method, []).append(self.now() - started)
                 table = whole.with_outcome(index, outcome)
                 if table.compared:
                     write_table(self.folder, table)
@@ -211,10 +193,6 @@ class _Run:
             table = replace(table, stopped=True)
         write_table(self.folder, table)
         return table
-
-
-def _mean(seconds: Sequence[float]) -> float | None:
-    return sum(seconds) / len(seconds) if seconds else None
 
 
 def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone:
@@ -233,14 +211,7 @@ def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone
     )
 
 
-def run_comparison(
-    plan: Plan,
-    scan: ComparedScan,
-    sink: Sink,
-    clock: Clock,
-    now: Callable[[], float] = time.monotonic,
-    begun: float | None = None,
-) -> TrialTable:
+def run_comparison(plan: Plan, scan: ComparedScan, sink: Sink, clock: Clock) -> TrialTable:
     """Run all trials and write table, pictures and page into the folder. The event `done` names the folder.
 
     The table is written after every trial, so that an interruption loses at most one. After Ctrl-C the table is
@@ -249,15 +220,12 @@ def run_comparison(
 
     Args:
         plan: reads the scan and says which trials to run.
-        begun: by `now`, when the time of the run began; None: it begins here.
 
     Raises:
         ConfigError, DataError: nothing was written, or the table of the trials that were done.
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
-    started, end = clock.now(), math.inf
-    if (limit := scan.max_seconds) is not None:
-        end = (now() if begun is None else begun) + limit - min(_PAGES[0], _PAGES[1] * limit)
+    started = clock.now()
 
     def emit(event: Event) -> None:
         sink(replace(event, time=clock.now()))
@@ -266,7 +234,7 @@ def run_comparison(
     emit(planned.started)
     data, table, references = planned.data, planned.table, planned.references
     with _result_folder(scan.folder) as work:
-        run = _Run(work, scan.folder, scan.seed, end, now, emit, slices)
+        run = _Run(work, scan.folder, scan.seed, clock, emit, slices)
         data.save(work / DATA)
         if references:
             _add_references(work / DATA, data.truth, references, run)

@@ -117,8 +117,6 @@ def planned_tradeoff(scan: ComparedScan, warn: Warn, depth: Depth = "quick") -> 
         trials = plan(methods, geometry.n_views, gaussians, depth)
     else:
         trials = plan_in_equal_time(methods, geometry.n_views, gaussians, scan.seconds)
-    if scan.max_seconds is not None:
-        trials = telling_first(trials)
     table = replace(
         table,
         outcomes=tuple(Outcome(trial, "not run") for trial in trials),
@@ -185,9 +183,3 @@ def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> 
 def plan_in_equal_time(methods: Sequence[str], n_views: int, gaussians: int, seconds: float) -> tuple[Trial, ...]:
     """Each method once, all with the same time."""
     return tuple(trials_of(method, n_views, gaussians, "quick")[0].in_time(seconds) for method in methods)
-
-
-def telling_first(trials: Sequence[Trial]) -> tuple[Trial, ...]:
-    """The trials in an order for little time: each method once, direct ones first."""
-    alone = sorted((t for t in trials if t.group == "method"), key=lambda t: not by_name(t.method).traits.direct)
-    return tuple(dict.fromkeys([*alone, *trials]))

@@ -14,7 +14,7 @@ from beamline.features.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name, has_setting
 
-Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
+Status = Literal["done", "failed", "interrupted", "not run"]
 
 LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
 _ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach

@@ -18,8 +18,8 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.core.events import Event
 from beamline.core.machine import STATUS, peak_memory
-from beamline.features.trials import runner, tradeoff
-from beamline.features.trials.runner import ComparedScan, opened_scan, run_comparison, run_trial
+from beamline.features.trials import runner
+from beamline.features.trials.runner import ComparedScan, run_comparison, run_trial
 from beamline.features.trials.table import text
 from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
@@ -44,10 +44,8 @@ def _options(tmp_path: Path, **changes: Any) -> ComparedScan:
     return replace(scan, **{"methods": ("r2", "fbp"), "command": "beamline tradeoff scan.h5", **changes})
 
 
-def run_tradeoff(
-    scan: ComparedScan, sink: Callable[[Event], None] = lambda e: None, *how: Any, **more: Any
-) -> TrialTable:
-    return run_comparison(partial(planned_tradeoff, scan), scan, sink, SystemClock(), *how, **more)
+def run_tradeoff(scan: ComparedScan, sink: Callable[[Event], None] = lambda e: None) -> TrialTable:
+    return run_comparison(partial(planned_tradeoff, scan), scan, sink, SystemClock())
 
 
 def _made_up(trial: Trial, work: Path | None = None, *_: object, keep: bool = False) -> Outcome:
@@ -137,34 +135,6 @@ def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
     assert run_tradeoff(options).compared
 
 
-def test_a_limit_of_time_bounds_reading_and_the_page(
-    tmp_path: Path, made_up: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On a clock on which reading takes 20 s and each trial 5 s."""
-    at = 100.0
-
-    def read(*args: Any, **more: Any) -> Any:
-        nonlocal at
-        at += 20
-        return opened(*args, **more)
-
-    def trial(one: Trial, work: Path, seed: int, remaining: float, *, keep: bool) -> Outcome:
-        nonlocal at
-        at += min(5, remaining)
-        return _made_up(one) if remaining >= 5 else Outcome(one, "out of time")
-
-    opened = opened_scan
-    monkeypatch.setattr(tradeoff, "opened_scan", read)
-    made_up(trial)
-    table = run_tradeoff(_options(tmp_path, max_seconds=60.0), lambda e: None, lambda: at, begun=95.0)
-    assert at <= 150  # 60 s from 95 on, less five for the page
-    done = [outcome.trial for outcome in table.compared]
-    assert [each.method for each in done[:2]] == ["fbp", "r2"]  # each method once, the direct one first
-    refused = [outcome.message for outcome in table.outcomes if outcome.status == "not run"]
-    assert len(refused) == len(table.outcomes) - len(done)
-    assert all("not begun: it would take about 5 s" in message for message in refused)
-
-
 def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any) -> None:
     made_up(lambda trial, *_, **__: Outcome(trial, "failed", message="no room"))
     table = run_tradeoff(_options(tmp_path))
@@ -174,19 +144,18 @@ def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any)
 
 
 @pytest.mark.parametrize(
-    ("program", "limit", "status", "said"),
+    ("program", "status", "said"),
     [
-        ("import time; time.sleep(60)", 0.5, "out of time", "--max-seconds"),
-        ("import sys; sys.exit('it broke')", math.inf, "failed", "it broke"),
-        ('print(\'{"event": "failed", "message": "no matter"}\')', math.inf, "failed", "no matter"),
-        ('print(\'words\'); print(\'{"event": "result", "seconds": 2.5}\')', 60.0, "done", ""),
+        ("import sys; sys.exit('it broke')", "failed", "it broke"),
+        ('print(\'{"event": "failed", "message": "no matter"}\')', "failed", "no matter"),
+        ('print(\'words\'); print(\'{"event": "result", "seconds": 2.5}\')', "done", ""),
     ],
 )
 def test_what_becomes_of_a_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, limit: float, status: str, said: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, status: str, said: str
 ) -> None:
     monkeypatch.setattr(runner, "COMMAND", [sys.executable, "-c", program])
-    outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0, limit)
+    outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0)
     assert (outcome.status, said in outcome.message) == (status, True)
     assert (outcome.seconds == 2.5) is (status == "done")
 
@@ -198,7 +167,7 @@ def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
     prepared = prepared_views(SCAN.line_integrals().astype(np.float32), views)
     TrialData(prepared, SCAN.truth(Grid.matching(views))).save(tmp_path / DATA)
     ballast = np.ones(90_000_000)  # 720 MB
-    outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)
+    outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0)
     assert outcome.status == "done", outcome.message
     assert outcome.quality("psnr") > 20
     assert (outcome.peak_bytes is None) != STATUS.is_file()  # Linux

@@ -29,7 +29,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, TrialData]]:
     """Rows are off the truth by ERROR everywhere; the FBP of all views is the truth."""
     found: list[tuple[Trial, TrialData]] = []
 
-    def trial(trial: Trial, work: Path, seed: int, limit: float, *, keep: bool) -> Outcome:
+    def trial(trial: Trial, work: Path, seed: int, *, keep: bool) -> Outcome:
         data = TrialData.load(work / DATA)
         grid = Grid.matching(data.geometry)
         volume = SCAN.truth(grid) + np.float32(ERROR if found else 0)
