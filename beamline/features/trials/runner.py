@@ -199,7 +199,7 @@ def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone
     """A trial that has ended, the n-th of so many; `gaussians` are those at its start, as in its settings."""
     trial = outcome.trial
     figures = {
-        **{name: getattr(trial, name) for name in ("group", "method", "views", "binning")},
+        **{name: getattr(trial, name) for name in ("group", "method", "views")},
         **trial.settings,
         "cpu_seconds": outcome.cpu_seconds,
         "gaussians_end": outcome.gaussians,

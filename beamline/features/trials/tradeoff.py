@@ -100,7 +100,6 @@ _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.
 _BASE_STEPS = {"quick": 250, "full": 1000}
 _STEPS = {"quick": (60, 125, 250, 500), "full": (125, 250, 500, 1000, 2000)}
 _FACTORS = {"quick": (0.25,), "full": (0.25, 0.5, 2.0)}
-_BINNED_STEPS = {"quick": (250,), "full": (125, 500, 1000)}
 
 
 def planned_tradeoff(scan: ComparedScan, warn: Warn, depth: Depth = "quick") -> Planned:
@@ -145,22 +144,16 @@ def trials_of(method: str, n_views: int, gaussians: int, depth: Depth) -> list[T
 
 def _fits(method: str, n_views: int, gaussians: int, depth: Depth) -> list[Trial]:
     usual: dict[str, Plain] = {"steps": _BASE_STEPS[depth], "gaussians": gaussians}
-    # A bin of two halves the detail across: a quarter of the Gaussians describes it.
-    coarse = max(1, gaussians // 4)
     changes: list[tuple[str, Mapping[str, Plain]]] = [
         ("method", {}),
         *(("steps", {"steps": n}) for n in _STEPS[depth] if n != usual["steps"]),
         *(("gaussians", {"gaussians": max(1, round(factor * gaussians))}) for factor in _FACTORS[depth]),
-        *(("binning", {"steps": n, "gaussians": coarse}) for n in _BINNED_STEPS[depth]),
         *(("kernel", {"fit.kernel": kernel.value}) for kernel in Kernel if kernel is not FitSettings().kernel),
         ("start", {"start": "tv"}),
         ("loss", {"fit.ssim_weight": 0.0}),
         *(("loss", {"fit.loss": loss}) for loss in ("l2", "poisson")),
     ]
-    return [
-        Trial(group, method, n_views, 2 if group == "binning" else 1, {**usual, **changed})
-        for group, changed in changes
-    ]
+    return [Trial(group, method, n_views, {**usual, **changed}) for group, changed in changes]
 
 
 def plan(methods: Sequence[str], n_views: int, gaussians: int, depth: Depth) -> tuple[Trial, ...]:

@@ -29,7 +29,6 @@ class Trial:
         group: what it varies: "method" where nothing.
         method: its name in `recon.methods`.
         views: how many, spread evenly over those of the scan, or as many as `choice` has.
-        binning: of detector pixels, on top of the selection's.
         settings: of the method, by name as `recon.methods.build` takes them.
         seconds_asked: after which the reconstruction ends; None: when its work is done.
         choice: which views; None: `views` of them, evenly spread.
@@ -38,7 +37,6 @@ class Trial:
     group: str
     method: str
     views: int
-    binning: int = 1
     settings: Mapping[str, Plain] = field(default_factory=dict, hash=False)
     seconds_asked: float | None = None
     choice: ViewChoice | None = None
@@ -77,7 +75,6 @@ class Trial:
         if self.choice is not None:
             return f"{self.choice.label}: {self.method}"
         parts = [self.method, f"{self.views} views"]
-        parts += [f"bin {self.binning}"] if self.binning > 1 else []
         parts += [f"{self.seconds_asked:g} s"] if self.seconds_asked is not None else []
         return ", ".join([*parts, *(_in_words(name, value) for name, value in self.settings.items())])
 
@@ -219,7 +216,7 @@ class TrialTable:
         every = [each.trial for each in self.outcomes]
         values: dict[str, Any] = {
             "row": trial.label if trial.choice is None else trial.choice.label,
-            **{name: getattr(trial, name) for name in ("group", "method", "views", "binning", "frames")},
+            **{name: getattr(trial, name) for name in ("group", "method", "views", "frames")},
             "window": 1 if trial.choice is None else trial.choice.window,
             **{name: trial.settings.get(name) for each in every for name in each.settings},
             "status": outcome.status,

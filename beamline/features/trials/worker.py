@@ -21,7 +21,6 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
-from scipy import ndimage
 from scipy.special import logsumexp
 
 from beamline.core.errors import DataError
@@ -32,7 +31,7 @@ from beamline.features.trials.trial import Trial
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.measure import squares_left
-from beamline.reconstruct.run import binned, run_on
+from beamline.reconstruct.run import run_on
 from recon.assess import metrics
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
@@ -40,7 +39,6 @@ from recon.base.method import RunControl, SampleRadius
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.prep.correct import Projections
-from recon.reconstruction import Reconstruction
 from recon.voxels.projector import project
 from recon.voxels.resolution import ViewResolution
 from recon.warm_up import warm_up
@@ -194,13 +192,15 @@ def run(
     """
     prepared = _views_of(trial, data)
     grid = Grid.matching(data.geometry)
-    warm_up(trial.build(), data.geometry)  # so that compilation is in no trial's time
+    method, control = trial.build(), RunControl(now=now)
+    warm_up(method, data.geometry)  # so that compilation is in no trial's time
     reset_peak_memory()
     before = cpu()
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", UserWarning)
-        result = _reconstruct(trial, prepared, grid, seed, now)
-    volume = on_grid(result.volume, grid).data
+        in_time = control if trial.seconds_asked is None else control.by(now() + trial.seconds_asked)
+        result = run_on(method, prepared, grid, seed, in_time)
+    volume = result.volume.data
     cpu_seconds, peak = cpu() - before, peak_memory()  # before measuring, which has needs of its own
     figures, squared = measured(trial.method, volume, data, grid)
     return {
@@ -245,34 +245,6 @@ def measured(method: str, volume: F32, data: TrialData, grid: Grid) -> tuple[dic
         figures["residual_held_out"] = math.sqrt(left.sum() / own.sum())
         squared = left.tolist()
     return figures, squared
-
-
-def _reconstruct(
-    trial: Trial,
-    prepared: PreparedProjections,
-    grid: Grid,
-    seed: int,
-    now: Callable[[], float] = time.perf_counter,
-) -> Reconstruction:
-    """The volume of a trial, as every command makes one; it ends when the trial's seconds, if any, are over.
-
-    A model without voxels fills `grid` from binned views, too; others have one voxel a binned pixel.
-    """
-    method, views = trial.build(), binned(prepared, trial.binning)
-    target = grid if method.traits.any_grid or trial.binning == 1 else Grid.matching(views.geometry)
-    control = RunControl(now=now)
-    in_time = control if trial.seconds_asked is None else control.by(now() + trial.seconds_asked)
-    return run_on(method, views, target, seed, in_time)
-
-
-def on_grid(volume: Volume, grid: Grid) -> Volume:
-    """The volume on another grid, by linear interpolation at its voxels' centres (edge values beyond the ends)."""
-    if volume.grid == grid:
-        return volume
-    edges = volume.grid.spacing
-    scale, offset = np.divide(grid.spacing, edges), np.subtract(grid.first, volume.grid.first) / edges
-    data = ndimage.affine_transform(volume.data, scale, offset, grid.shape, np.float32, order=1, mode="nearest")
-    return Volume(data, grid)
 
 
 def main(folder: Path) -> int:

@@ -86,7 +86,7 @@ def _whole(path: Path) -> bool:
 
 def _made_up(trial: Trial, work: Path, *_: object, keep: bool = False, **__: object) -> Outcome:
     """A trial that takes no time."""
-    amount = float(trial.views / trial.binning)
+    amount = float(trial.views)
     if keep:
         write_array(work / VOLUME, np.linspace(0, amount, 3200, dtype=np.float32).reshape(2, 40, 40))
     found = {"residual_held_out": 1 / amount, "psnr_all": amount, "ssim_all": 0.5}

@@ -52,7 +52,7 @@ def _made_up(trial: Trial, work: Path | None = None, *_: object, keep: bool = Fa
     """A trial that takes no time: more work gives more quality, for more seconds and memory."""
     if keep and work is not None:
         write_array(work / VOLUME, np.zeros((4, 40, 40), np.float32))
-    amount = float(int(trial.settings.get("steps") or 20) * trial.views / trial.binning)
+    amount = float(int(trial.settings.get("steps") or 20) * trial.views)
     metrics = {"residual_held_out": 1 / amount, "psnr": math.log(amount)}
     return Outcome(trial, "done", amount / 1000, int(1e6 * amount), metrics)
 

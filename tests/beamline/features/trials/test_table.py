@@ -105,7 +105,7 @@ def test_exactly_the_points_that_nothing_beats_are_kept(points: list[tuple[float
 METHODS = names_of_one_volume()
 CHOICES = st.lists(st.sampled_from(METHODS), min_size=1, unique=True)
 VARIED = {
-    "views": set(), "gaussians": {"gaussians"}, "steps": {"steps"}, "binning": {"gaussians", "steps"},
+    "views": set(), "gaussians": {"gaussians"}, "steps": {"steps"},
     "loss": {"fit.loss", "fit.ssim_weight"}, "start": {"start"}, "kernel": {"fit.kernel"},
     "iterations": {"iterations"},
 }  # fmt: skip
@@ -125,7 +125,6 @@ def test_one_change_at_a_time_about_each_methods_baseline(
         changed = {name for name, _ in trial.settings.items() ^ base.settings.items()}
         assert changed <= VARIED[trial.group]
         assert (trial.views != n_views) is (trial.group == "views")
-        assert (trial.binning != 1) is (trial.group == "binning")
         assert isinstance(trial.build(), by_name(trial.method))
         assert 2 <= trial.views <= n_views
 
