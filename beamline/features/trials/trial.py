@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from beamline.core.text import count
 from beamline.features.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name, has_setting
@@ -76,7 +75,7 @@ class Trial:
             return f"{self.choice.label}: {self.method}"
         parts = [self.method, f"{self.views} views"]
         parts += [f"{self.seconds_asked:g} s"] if self.seconds_asked is not None else []
-        return ", ".join([*parts, *(_in_words(name, value) for name, value in self.settings.items())])
+        return ", ".join([*parts, *(f"{value} {name}" for name, value in self.settings.items())])
 
 
 def _ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
@@ -85,20 +84,6 @@ def _ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
         return {}
     lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
     return {name: value for name, value in lengths.items() if has_setting(method, name)}
-
-
-_WORDS: Mapping[str, Callable[[Any], str]] = {
-    "steps": lambda n: f"{n} steps",
-    "gaussians": lambda n: f"{n / 1000:.3g}k Gaussians" if isinstance(n, int) and n >= 1000 else f"{n} Gaussians",
-    "iterations": lambda n: count(n, "iteration"),
-    "fit.loss": lambda name: f"{name} loss",
-    "fit.ssim_weight": lambda weight: f"ssim_weight {weight}" if weight else "no SSIM",
-    "fit.kernel": lambda name: f"{name} kernel",
-}
-
-
-def _in_words(name: str, value: Plain) -> str:
-    return _WORDS[name](value) if name in _WORDS else f"{name.rsplit('.', 1)[-1]} {value}"
 
 
 HELD_OUT = "residual_held_out"
