@@ -34,7 +34,6 @@ class ProcessEnd(Enum):
     EXITED = auto()
     STOPPED = auto()
     SILENT = auto()
-    OUT_OF_TIME = auto()
 
 
 class ChildProcess:
@@ -111,7 +110,6 @@ class ChildProcess:
         *,
         stop: Callable[[], bool] = lambda: False,
         hurry: Callable[[], bool] = lambda: False,
-        seconds: float = math.inf,
         silence: float = math.inf,
         grace: float = 0.0,
     ) -> ProcessEnd:
@@ -120,22 +118,18 @@ class ChildProcess:
         Args:
             stop: polled a few times a second; True ends the process.
             hurry: polled in the same way while the process ends; True kills it at once.
-            seconds: real s after which it is killed.
             silence: real s without a line, from now on, after which it is ended.
             grace: real s between the request to end and the kill; 0 kills at once.
         """
         self._silent_since = time.monotonic()
-        ending, deadline = ProcessEnd.EXITED, self._silent_since + seconds
+        ending = ProcessEnd.EXITED
         while self.running:
             with suppress(subprocess.TimeoutExpired):
-                self._process.wait(max(0.0, min(_POLL, deadline - time.monotonic())))
+                self._process.wait(_POLL)
                 break
-            now = time.monotonic()
-            if now >= deadline:
-                ending, grace = ProcessEnd.OUT_OF_TIME, 0.0
-            elif stop():
+            if stop():
                 ending = ProcessEnd.STOPPED
-            elif now - self._silent_since > silence:
+            elif time.monotonic() - self._silent_since > silence:
                 ending = ProcessEnd.SILENT
             else:
                 continue
@@ -187,7 +181,6 @@ def run_to_end(
     command: Sequence[str],
     log: Path,
     on_line: Callable[[str], None],
-    seconds: float = math.inf,
     silence: float = math.inf,
 ) -> tuple[ProcessEnd, int | None, str]:
     """Run a command with the same imports; an exception kills it.
@@ -195,7 +188,7 @@ def run_to_end(
     Args:
         log: file for its stderr.
         on_line: receives each line of its stdout.
-        seconds, silence: real s in all, and without a line, after which it is killed.
+        silence: real s without a line, after which it is killed.
 
     Returns:
         Why it ended, its exit code, and the last line of its stderr.
@@ -207,7 +200,7 @@ def run_to_end(
         log.open("w", encoding="utf-8") as stderr,
         ChildProcess(command, stderr, on_line, with_our_path(), tether=True) as process,
     ):
-        ending = process.wait(seconds=seconds, silence=silence)
+        ending = process.wait(silence=silence)
     return ending, process.code, last_line(log)
 
 

@@ -1,28 +1,22 @@
-"""Runner: reads the scan once, runs each trial in a separate process, writes the table."""
+"""Runner: reads the scan once, runs each trial, writes the table."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
-
-import numpy as np
 
 from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError
 from beamline.core.events import Done, Event, Sink, TrialReached
 from beamline.core.files import refuse_existing, refuse_not_utf8
 from beamline.core.machine import machine
-from beamline.core.process import json_object, run_to_end
 from beamline.core.recon_events import TrialDone
 from beamline.core.sinks import Warn, Warnings
+from beamline.features.trials.run_trial import TrialData, run_trial
 from beamline.features.trials.table import write_page, write_table
 from beamline.features.trials.trial import HELD_OUT, Outcome, Trial, TrialTable
-from beamline.features.trials.worker import DATA, VOLUME, TrialData, TrialJob, add_references
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
@@ -37,7 +31,6 @@ from recon.base.empirical import ONE_IN
 from recon.base.volume import Grid
 from recon.methods import by_name
 
-COMMAND = (sys.executable, "-m", "beamline.features.trials.worker")
 _HELD_OUT_VIEWS = 16  # at most
 
 
@@ -113,42 +106,11 @@ def opened_scan(
     return TrialData(prepared, truth), table
 
 
-def run_trial(trial: Trial, work: Path, seed: int, *, keep: bool = False) -> Outcome:
-    """Run one trial in a separate process, which has ended when this returns or raises.
-
-    Args:
-        work: a folder with the data, `DATA`.
-        keep: its volume [z, y, x] is written to the file `VOLUME` of the folder.
-
-    Raises:
-        DataError: the disk did not take the job or the volume: trials to come would fail, too.
-    """
-    event = dict[str, Any]()
-
-    def on_line(line: str) -> None:
-        nonlocal event
-        event = json_object(line) or event
-
-    TrialJob(trial, seed, keep).save(work)
-    _, code, reason = run_to_end([*COMMAND, str(work)], work / "stderr.txt", on_line)
-    if event.pop("event", None) == "result":
-        return Outcome(trial, "done", **event)
-    message = event.get("message", f"its process ended with code {code}" + (f": {reason}" if reason else ""))
-    if code == DataError.exit_code:
-        raise DataError(message)
-    return Outcome(trial, "failed", message=message)
-
-
 @dataclass(frozen=True)
 class _Run:
-    """Where trials run, and how they report.
+    """What trials reconstruct, and how they report; `slices` gets those that the page shows."""
 
-    Attributes:
-        work: folder with the data.
-        slices: gets those that the page shows.
-    """
-
-    work: Path
+    data: TrialData
     folder: Path
     seed: int
     clock: Clock
@@ -156,17 +118,12 @@ class _Run:
     slices: SliceSheet
 
     def run(self, trial: Trial) -> tuple[Outcome, F32 | None]:
-        """The outcome, and the volume [z, y, x] of a trial that the page shows."""
-        path, shown = self.work / VOLUME, trial.group == "method"
-        outcome = run_trial(trial, self.work, self.seed, keep=shown)
-        if not path.exists():
-            return outcome, None
-        volume: F32 = np.load(path)
-        path.unlink()
-        if trial.choice is None:
-            self.slices.add(by_name(trial.method).label, volume)
-        else:
+        """The outcome, and the volume [z, y, x] of a trial that did not fail."""
+        outcome, volume = run_trial(trial, self.data, self.seed)
+        if volume is not None and trial.choice is not None:
             self.slices.add(trial.label, volume, trial.choice.family, trial.method)
+        elif volume is not None and trial.group == "method":
+            self.slices.add(by_name(trial.method).label, volume)
         return outcome, volume
 
     def all(self, table: TrialTable) -> TrialTable:
@@ -215,8 +172,7 @@ def run_comparison(plan: Plan, scan: ComparedScan, sink: Sink, clock: Clock) -> 
     """Run all trials and write table, pictures and page into the folder. The event `done` names the folder.
 
     The table is written after every trial, so that an interruption loses at most one. After Ctrl-C the table is
-    `stopped`. A folder without results is removed. The views lie in a file of the folder while the trials run: this
-    process does not keep them.
+    `stopped`. A folder without results is removed.
 
     Args:
         plan: reads the scan and says which trials to run.
@@ -232,24 +188,25 @@ def run_comparison(plan: Plan, scan: ComparedScan, sink: Sink, clock: Clock) -> 
 
     planned, slices = plan(Warnings(sink, clock)), SliceSheet()
     emit(planned.started)
-    data, table, references = planned.data, planned.table, planned.references
-    with _result_folder(scan.folder) as work:
-        run = _Run(work, scan.folder, scan.seed, clock, emit, slices)
-        data.save(work / DATA)
-        if references:
-            _add_references(work / DATA, data.truth, references, run)
-        if data.truth is not None:
-            slices.add("truth", data.truth)
-        del planned, data
-        table = run.all(table)
+    run = _Run(planned.data, scan.folder, scan.seed, clock, emit, slices)
+    scan.folder.mkdir()
+    try:
+        if planned.references:
+            run = replace(run, data=_with_references(run, planned.references))
+        if run.data.truth is not None:
+            slices.add("truth", run.data.truth)
+        table = run.all(planned.table)
+    finally:
+        with suppress(OSError):  # it has results; without any the next run would refuse it
+            scan.folder.rmdir()
     write_page(scan.folder, table, slices)
     summary = {"output": scan.folder, "trials": len(table.todo), "done": len(table.compared), "stopped": table.stopped}
     emit(Done({**summary, "seconds": clock.now() - started}))
     return table
 
 
-def _add_references(folder: Path, truth: F32 | None, references: Sequence[Trial], run: _Run) -> None:
-    """Add the volumes of these trials to the data, and the dense and empty regions of the truth or of the first one.
+def _with_references(run: _Run, references: Sequence[Trial]) -> TrialData:
+    """The data with the volumes of these trials, and the dense and empty regions of the truth or of the first one.
 
     Raises:
         DataError: a reference could not be made.
@@ -260,22 +217,7 @@ def _add_references(folder: Path, truth: F32 | None, references: Sequence[Trial]
         if volume is None:
             raise DataError(f"{reference.label}, to compare with, failed: {outcome.message}. Nothing was written.")
         volumes[reference.method] = volume
-    contrast = next(iter(volumes.values())) if truth is None else truth
+    contrast = next(iter(volumes.values())) if run.data.truth is None else run.data.truth
     with suppress(ValueError):  # it has no dense and empty regions
         regions = metrics.kmeans_mask(metrics.sampled(contrast), run.seed)
-    add_references(folder, volumes, regions)
-
-
-@contextmanager
-def _result_folder(folder: Path) -> Iterator[Path]:
-    """Make the folder of a result, and a temporary folder in it, which is removed at the end of the block.
-
-    An empty result folder is removed, too, because the next run would refuse it.
-    """
-    folder.mkdir()
-    try:
-        with TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as work:
-            yield Path(work)
-    finally:
-        with suppress(OSError):  # it has results
-            folder.rmdir()
+    return replace(run.data, references=volumes, regions=regions)

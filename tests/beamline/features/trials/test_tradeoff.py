@@ -28,9 +28,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def quick_trials(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
     seen: list[Trial] = []
 
-    def trial(trial: Trial, *_: object, keep: bool) -> Outcome:
+    def trial(trial: Trial, *_: object) -> tuple[Outcome, None]:
         seen.append(trial)
-        return Outcome(trial, "done", float(len(seen)), 10**8, {"residual_held_out": 1 / (1 + len(seen))})
+        return Outcome(trial, "done", float(len(seen)), 10**8, {"residual_held_out": 1 / (1 + len(seen))}), None
 
     monkeypatch.setattr(runner, "run_trial", trial)
     return seen
@@ -51,10 +51,10 @@ def test_ctrl_c_is_exit_code_4_with_a_table(
 ) -> None:
     trial = runner.run_trial
 
-    def interrupted(*arguments: Any, **named: Any) -> Outcome:
+    def interrupted(*arguments: Any) -> Any:
         if len(quick_trials) == 2:
             signal.raise_signal(signal.SIGINT)
-        return trial(*arguments, **named)
+        return trial(*arguments)
 
     monkeypatch.setattr(runner, "run_trial", interrupted)
     result = beamline("tradeoff", "scan.h5", "--axis", "20.7", "-o", "out")
