@@ -34,6 +34,7 @@ class ProcessEnd(Enum):
     EXITED = auto()
     STOPPED = auto()
     SILENT = auto()
+    OUT_OF_TIME = auto()
 
 
 class ChildProcess:
@@ -110,6 +111,7 @@ class ChildProcess:
         *,
         stop: Callable[[], bool] = lambda: False,
         hurry: Callable[[], bool] = lambda: False,
+        seconds: float = math.inf,
         silence: float = math.inf,
         grace: float = 0.0,
     ) -> ProcessEnd:
@@ -118,18 +120,22 @@ class ChildProcess:
         Args:
             stop: polled a few times a second; True ends the process.
             hurry: polled in the same way while the process ends; True kills it at once.
+            seconds: real s after which it is killed.
             silence: real s without a line, from now on, after which it is ended.
             grace: real s between the request to end and the kill; 0 kills at once.
         """
         self._silent_since = time.monotonic()
-        ending = ProcessEnd.EXITED
+        ending, deadline = ProcessEnd.EXITED, self._silent_since + seconds
         while self.running:
             with suppress(subprocess.TimeoutExpired):
-                self._process.wait(_POLL)
+                self._process.wait(max(0.0, min(_POLL, deadline - time.monotonic())))
                 break
-            if stop():
+            now = time.monotonic()
+            if now >= deadline:
+                ending, grace = ProcessEnd.OUT_OF_TIME, 0.0
+            elif stop():
                 ending = ProcessEnd.STOPPED
-            elif time.monotonic() - self._silent_since > silence:
+            elif now - self._silent_since > silence:
                 ending = ProcessEnd.SILENT
             else:
                 continue

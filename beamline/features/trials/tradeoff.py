@@ -124,7 +124,7 @@ def trials_of(method: str, n_views: int, depth: Depth) -> list[Trial]:
     """
     if (lengths := METHODS[method].lengths) is None:
         return [Trial("method", method, n_views)]
-    base, *others = ({lengths.setting: length} for length in getattr(lengths, depth))
+    base, *others = (dict[str, Plain]({lengths.setting: length}) for length in getattr(lengths, depth))
     varied = [Trial(lengths.setting, method, n_views, settings=each) for each in others]
     return [Trial("method", method, n_views, settings=base), *varied]
 

@@ -113,7 +113,7 @@ def main() -> None:
     for words in commands:
         for module in _MODULES[words[0]].split():
             import_module(f"beamline.{module}")
-    runner.run_trial = _made_up
+    runner.run_trial = _made_up  # type: ignore[assignment,attr-defined]
     figures.canvas = BlankCanvas
     os.chdir(folder)
     out, counted = Path("out"), Path("count")

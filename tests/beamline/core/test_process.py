@@ -60,6 +60,13 @@ def test_lines_code_and_stderr_arrive(tmp_path: Path) -> None:
     assert child.log.read_text(encoding="utf-8").strip() == "no room"
 
 
+def test_a_process_is_killed_when_its_time_is_over(tmp_path: Path) -> None:
+    child, begin = _Child(tmp_path, IGNORES), time.monotonic()
+    assert child.process.wait(seconds=0.2, grace=100.0) is ProcessEnd.OUT_OF_TIME
+    assert 0.2 <= time.monotonic() - begin < 30.0
+    assert not child.process.running
+
+
 @posix
 def test_a_stopped_process_may_deliver_within_its_grace(tmp_path: Path) -> None:
     child = _Child(tmp_path, DELIVERS)

@@ -49,7 +49,7 @@ def test_the_table_is_on_stdout_and_the_rest_on_stderr(folder: Path, quick_trial
 def test_ctrl_c_is_exit_code_4_with_a_table(
     folder: Path, monkeypatch: pytest.MonkeyPatch, quick_trials: list[Trial]
 ) -> None:
-    trial = runner.run_trial
+    trial = vars(runner)["run_trial"]
 
     def interrupted(*arguments: Any) -> Any:
         if len(quick_trials) == 2:
