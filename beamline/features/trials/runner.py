@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from beamline.core.durations import seconds_left
@@ -106,50 +107,42 @@ def opened_scan(
     return TrialData(prepared, truth), table
 
 
-@dataclass(frozen=True)
-class _Run:
-    """What trials reconstruct, and how they report; `slices` gets those that the page shows."""
+def _run_and_show(slices: SliceSheet, seed: int, data: TrialData, trial: Trial) -> tuple[Outcome, F32 | None]:
+    """The outcome and the volume [z, y, x] of a trial; None where it failed. The page shows baselines and rows."""
+    outcome, volume = run_trial(trial, data, seed)
+    if volume is not None and trial.choice is not None:
+        slices.add(trial.label, volume, trial.choice.family, trial.method)
+    elif volume is not None and trial.group == "method":
+        slices.add(by_name(trial.method).label, volume)
+    return outcome, volume
 
-    data: TrialData
-    folder: Path
-    seed: int
-    clock: Clock
-    emit: Callable[[Event], None]
-    slices: SliceSheet
 
-    def run(self, trial: Trial) -> tuple[Outcome, F32 | None]:
-        """The outcome, and the volume [z, y, x] of a trial that did not fail."""
-        outcome, volume = run_trial(trial, self.data, self.seed)
-        if volume is not None and trial.choice is not None:
-            self.slices.add(trial.label, volume, trial.choice.family, trial.method)
-        elif volume is not None and trial.group == "method":
-            self.slices.add(by_name(trial.method).label, volume)
-        return outcome, volume
+def _run_all(
+    table: TrialTable, run: Callable[[Trial], tuple[Outcome, F32 | None]], folder: Path, sink: Sink, clock: Clock
+) -> TrialTable:
+    """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
 
-    def all(self, table: TrialTable) -> TrialTable:
-        """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
-
-        Raises:
-            KeyboardInterrupt: before any trial was done; nothing was written.
-        """
-        begin, todo = self.clock.now(), table.todo
-        try:
-            for n, index in enumerate(todo):
-                trial, whole, spent = table.outcomes[index].trial, table, self.clock.now() - begin
-                eta, rate = seconds_left(n, len(todo), spent), 60 * n / max(spent, 1e-9)
-                self.emit(TrialReached(table.name, n, len(todo), trial.label, eta, rate))
-                table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
-                outcome, _ = self.run(trial)
-                table = whole.with_outcome(index, outcome)
-                if table.compared:
-                    write_table(self.folder, table)
-                self.emit(_event_of(table, n + 1, len(todo), outcome))
-        except KeyboardInterrupt:
-            if not table.compared:
-                raise
-            table = replace(table, stopped=True)
-        write_table(self.folder, table)
-        return table
+    Raises:
+        KeyboardInterrupt: before any trial was done; nothing was written.
+    """
+    begin, todo = clock.now(), table.todo
+    try:
+        for n, index in enumerate(todo):
+            trial, whole, spent = table.outcomes[index].trial, table, clock.now() - begin
+            eta, rate = seconds_left(n, len(todo), spent), 60 * n / max(spent, 1e-9)
+            sink(TrialReached(table.name, n, len(todo), trial.label, eta, rate, time=clock.now()))
+            table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
+            outcome, _ = run(trial)
+            table = whole.with_outcome(index, outcome)
+            if table.compared:
+                write_table(folder, table)
+            sink(replace(_event_of(table, n + 1, len(todo), outcome), time=clock.now()))
+    except KeyboardInterrupt:
+        if not table.compared:
+            raise
+        table = replace(table, stopped=True)
+    write_table(folder, table)
+    return table
 
 
 def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone:
@@ -181,43 +174,41 @@ def run_comparison(plan: Plan, scan: ComparedScan, sink: Sink, clock: Clock) -> 
         ConfigError, DataError: nothing was written, or the table of the trials that were done.
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
-    started = clock.now()
-
-    def emit(event: Event) -> None:
-        sink(replace(event, time=clock.now()))
-
-    planned, slices = plan(Warnings(sink, clock)), SliceSheet()
-    emit(planned.started)
-    run = _Run(planned.data, scan.folder, scan.seed, clock, emit, slices)
+    started, slices = clock.now(), SliceSheet()
+    planned, run = plan(Warnings(sink, clock)), partial(_run_and_show, slices, scan.seed)
+    sink(replace(planned.started, time=clock.now()))
     scan.folder.mkdir()
     try:
-        if planned.references:
-            run = replace(run, data=_with_references(run, planned.references))
-        if run.data.truth is not None:
-            slices.add("truth", run.data.truth)
-        table = run.all(planned.table)
+        data = _with_references(planned.data, planned.references, partial(run, planned.data), scan.seed)
+        if data.truth is not None:
+            slices.add("truth", data.truth)
+        table = _run_all(planned.table, partial(run, data), scan.folder, sink, clock)
     finally:
         with suppress(OSError):  # it has results; without any the next run would refuse it
             scan.folder.rmdir()
     write_page(scan.folder, table, slices)
     summary = {"output": scan.folder, "trials": len(table.todo), "done": len(table.compared), "stopped": table.stopped}
-    emit(Done({**summary, "seconds": clock.now() - started}))
+    sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
     return table
 
 
-def _with_references(run: _Run, references: Sequence[Trial]) -> TrialData:
+def _with_references(
+    data: TrialData, references: Sequence[Trial], run: Callable[[Trial], tuple[Outcome, F32 | None]], seed: int
+) -> TrialData:
     """The data with the volumes of these trials, and the dense and empty regions of the truth or of the first one.
 
     Raises:
         DataError: a reference could not be made.
     """
+    if not references:
+        return data
     volumes, regions = dict[str, F32](), None
     for reference in references:
-        outcome, volume = run.run(reference)
+        outcome, volume = run(reference)
         if volume is None:
             raise DataError(f"{reference.label}, to compare with, failed: {outcome.message}. Nothing was written.")
         volumes[reference.method] = volume
-    contrast = next(iter(volumes.values())) if run.data.truth is None else run.data.truth
+    contrast = next(iter(volumes.values())) if data.truth is None else data.truth
     with suppress(ValueError):  # it has no dense and empty regions
-        regions = metrics.kmeans_mask(metrics.sampled(contrast), run.seed)
-    return replace(run.data, references=volumes, regions=regions)
+        regions = metrics.kmeans_mask(metrics.sampled(contrast), seed)
+    return replace(data, references=volumes, regions=regions)
