@@ -127,18 +127,12 @@ def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[st
 
 
 def _begin(folder: Path, recipe: bytes) -> None:
-    """Make the folder, or check that it belongs to this recipe."""
-    if folder.exists():
-        _refuse_other(folder, recipe)
-    else:
+    """Make the folder. Raises DataError for one that is not that of a batch by this recipe."""
+    if not folder.exists():
         with whole_file(folder) as partial:
             partial.mkdir()
             (partial / RECIPE).write_bytes(recipe)
             _write(partial, [])
-
-
-def _refuse_other(folder: Path, recipe: bytes) -> None:
-    """Raises DataError for a folder that is not that of a batch by this recipe."""
     kept = folder / RECIPE
     if not (folder / TABLE).is_file():
         raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")
