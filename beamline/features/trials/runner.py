@@ -10,10 +10,10 @@ from pathlib import Path
 
 from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError
-from beamline.core.events import Done, Event, Sink, TrialReached
+from beamline.core.events import Done, Sink, TrialReached
 from beamline.core.files import refuse_existing, refuse_not_utf8
 from beamline.core.machine import machine
-from beamline.core.recon_events import TrialDone
+from beamline.core.recon_events import TrialDone, TrialsStarted
 from beamline.core.sinks import Warn, Warnings
 from beamline.features.trials.run_trial import TrialData, run_trial
 from beamline.features.trials.table import write_page, write_table
@@ -63,14 +63,12 @@ class Planned:
 
     Attributes:
         table: before any trial is done.
-        started: the event that announces it.
         references: trials whose volumes others are compared with, in addition to the truth: each with those of its
             method. Without a truth the first one has the dense and the empty regions.
     """
 
     data: TrialData
     table: TrialTable
-    started: Event
     references: tuple[Trial, ...] = ()
 
 
@@ -176,18 +174,20 @@ def run_comparison(plan: Plan, scan: ComparedScan, sink: Sink, clock: Clock) -> 
     """
     started, slices = clock.now(), SliceSheet()
     planned, run = plan(Warnings(sink, clock)), partial(_run_and_show, slices, scan.seed)
-    sink(replace(planned.started, time=clock.now()))
+    table, todo = planned.table, len(planned.table.todo)
+    left_out = len(table.outcomes) - todo
+    sink(TrialsStarted(scan.source.path, table.name, todo, left_out, table.by, time=clock.now()))
     scan.folder.mkdir()
     try:
         data = _with_references(planned.data, planned.references, partial(run, planned.data), scan.seed)
         if data.truth is not None:
             slices.add("truth", data.truth)
-        table = _run_all(planned.table, partial(run, data), scan.folder, sink, clock)
+        table = _run_all(table, partial(run, data), scan.folder, sink, clock)
     finally:
         with suppress(OSError):  # it has results; without any the next run would refuse it
             scan.folder.rmdir()
     write_page(scan.folder, table, slices)
-    summary = {"output": scan.folder, "trials": len(table.todo), "done": len(table.compared), "stopped": table.stopped}
+    summary = {"output": scan.folder, "trials": todo, "done": len(table.compared), "stopped": table.stopped}
     sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
     return table
 

@@ -11,7 +11,6 @@ from itertools import chain
 from typing import Literal
 
 from beamline.core.errors import DataError
-from beamline.core.recon_events import StudyStarted, TradeoffStarted
 from beamline.core.sinks import Warn
 from beamline.features.trials.runner import ComparedScan, Planned, opened_scan
 from beamline.features.trials.trial import Outcome, Trial
@@ -68,12 +67,10 @@ def planned_study(
     for choice in choices:
         if choice.groups is None:
             warn(f"{choice.label} is left out: {choice.reason}")
-    left_out = len(table.outcomes) - len(table.todo)
-    started = StudyStarted(scan.source.path, len(table.todo), left_out, study.name)
     whole = ViewChoice(REFERENCE, [[view] for view in range(n_views)])
     references = tuple(trial(method, whole) for method in dict.fromkeys((BASELINE, *scan.methods)))
     data = replace(data, prepared=replace(data.prepared, held_out=None))
-    return Planned(data, table, started, references)
+    return Planned(data, table, references)
 
 
 def _note(n_views: int) -> str:
@@ -113,7 +110,7 @@ def planned_tradeoff(scan: ComparedScan, warn: Warn, depth: Depth = "quick") -> 
         outcomes=tuple(Outcome(trial, "not run") for trial in trials),
         scan={**table.scan, "views used": str(geometry.n_views)},
     )
-    return Planned(data, table, TradeoffStarted(scan.source.path, len(trials), table.by))
+    return Planned(data, table)
 
 
 def trials_of(method: str, n_views: int, depth: Depth) -> list[Trial]:

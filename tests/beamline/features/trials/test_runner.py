@@ -78,7 +78,7 @@ def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) 
     assert page.count("data:image/png;base64,") == 2
     assert all(outcome.trial.label in page for outcome in table.compared)
     names = [event.event for event in events if event.event != "progress"]
-    assert names == ["tradeoff_started", *["trial"] * len(rows), "done"]
+    assert names == ["trials_started", *["trial"] * len(rows), "done"]
     said, first = next(e.data for e in events if e.event == "trial"), table.outcomes[0].trial
     assert {name: said[name] for name in first.settings} == first.settings and said["views"] == first.views
 

@@ -112,7 +112,7 @@ def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any
     np.testing.assert_allclose(mean.prepared.projections.data, -np.log(light), atol=1e-5)
     np.testing.assert_allclose(np.degrees(mean.geometry.angles), np.arange(180) + 0.25, atol=1e-6)
     events = [json.loads(line) for line in result.stdout.splitlines()]
-    assert (events[0]["event"], events[-1]["event"], events[-1]["done"]) == ("study_started", "done", len(rows))
+    assert (events[0]["event"], events[-1]["event"], events[-1]["done"]) == ("trials_started", "done", len(rows))
 
 
 def test_ctrl_c_leaves_the_rows_done_and_says_so(
