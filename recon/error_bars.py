@@ -13,7 +13,6 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 from recon.base.arrays import F32, some_values
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
 from recon.base.method import Method, ReconProblem, RunControl, setting
 from recon.base.volume import Grid, Volume
 from recon.methods import with_settings, with_trait
@@ -121,8 +120,7 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
         raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
     smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
     _, by_patches = decided.get("strength", [(0.0, 0)])[-1]
-    at = decided.get("candidate", [-1])[-1]
-    return {0: smooth, 1: patches}.get(at, patches if by_patches else smooth)
+    return patches if by_patches else smooth
 
 
 def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
@@ -143,8 +141,7 @@ def alternating(geometry: Geometry) -> F32:
 
 def _alternating(method: Method, problem: ReconProblem) -> F32:
     """Half the difference of the FBPs of both halves of the views."""
-    filled = masked(problem.projections, problem.use.weights)[0]
-    signed = filled * alternating(problem.geometry)[:, None, None]
+    signed = problem.views.masked().data * alternating(problem.geometry)[:, None, None]
     return direct(signed, problem.geometry, problem.grid, method.filter if isinstance(method, Fbp) else "hann")
 
 
@@ -156,7 +153,8 @@ def _refitted(
     refit: IterativeMethod = with_settings(method, {"iterations": max(1, round(_SHARE * method.iterations))})
     sweeps, begin, done, stopped = refit.iterations, control.now(), 0, False
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
-    data, known = masked(problem.projections, problem.use.weights)
+    given = problem.views.masked()
+    data, known = given.data, given.weights
     projector, signs = Projector(problem.geometry, problem.grid), alternating(problem.geometry)[:, None, None]
 
     def told(iteration: int, residual: float) -> bool:

@@ -11,14 +11,17 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, DataUse, Method, Progress, ReconProblem, RunControl, candidates_of
+from recon.base.method import Clock, Method, Progress, ReconProblem, RunControl, candidates_of
+from recon.base.view_data import Views
 from recon.base.volume import Grid
-from recon.splatting.finish import FINISH_SWEEPS, FIRST_SHARE
+from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import count_for, joined_for
 from recon.splatting.settings import growth
-from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, TRIALS, choice_sweeps
+from recon.splatting.trial_fit import FIRST_SHARE
+from recon.voxels.choice import TRIALS
+from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.priors import STEPS
 
@@ -162,34 +165,35 @@ class Timing:
         return _timed(short, part, self._now, _FIT_STEPS).scaled(self._scale, grown * covers)
 
     def _of_fit(self, method: FitMethod) -> Forecast:
-        usual = method.as_candidate()
-        pace = self.fit_pace(usual)
+        pace = self.fit_pace(method)
         if method.finish_sweeps == 0:
             return Forecast(0.0, {method.name: pace.total})
-        rendered = 2 * _RENDER * self._geometry.n_views * pace.each / method.fit.views_per_step
-        finish = rendered + self._smooth.fixed + method.finish_sweeps * self._smooth.each
+        finish = self._rendered(method) + self._smooth.fixed + method.finish_sweeps * self._smooth.each
         choice = self.trial_seconds(FistaTv() if method.finish is not None else PnpDct())
         if method.finish is None:
             finish += PnpDct.iterations * self.pace(PnpDct()).each
-        volumes = {method.name: pace.total + finish}
-        if method.by_content and self._trial_share:
-            short = pace._replace(planned=method.least_steps or 0).total
-            volumes |= {FistaTv.name: short + self._smooth.total, PnpDct.name: short + self.pace(PnpDct()).total}
-            tried = pace._replace(planned=round(FIRST_SHARE * pace.planned)).total
-            choice += self._trial_share * (tried + rendered + FINISH_SWEEPS * self.pace(FistaTv(), of_trial=True).each)
-        return Forecast(choice, volumes)
+        return Forecast(choice, {method.name: pace.total + finish})
+
+    def _rendered(self, method: FitMethod) -> float:
+        """Seconds to render all views of a fit, for its finish."""
+        return 2 * _RENDER * self._geometry.n_views * self.fit_pace(method).each / method.fit.views_per_step
 
     def _of_choice(self, candidates: tuple[Method, ...]) -> Forecast:
-        """Forecast of a method that tries others: a fit's own trial judges them, too."""
+        """Forecast of a method that tries others, whose priors are sought once for all."""
         each = [self.of(candidate) for candidate in candidates]
         if not self._trial_share:
             return each[-1]
         volumes = {name: seconds for one in reversed(each) for name, seconds in one.volumes.items()}
-        if isinstance(candidates[-1], FitMethod):
-            return Forecast(each[-1].choice_seconds, volumes)
-        return Forecast(
-            sum(one.choice_seconds + self._trial_share * max(one.volumes.values()) for one in each), volumes
-        )
+        choice = max(one.choice_seconds for one in each) + self._trial_share * sum(map(self._tried, candidates))
+        return Forecast(choice, volumes)
+
+    def _tried(self, method: Method) -> float:
+        """Seconds of a method's own volume in a trial of all rows, beside the search for priors."""
+        if isinstance(method, FitMethod) and method.finish is None:
+            pace = self.fit_pace(method)
+            first = pace._replace(planned=round(FIRST_SHARE * pace.planned)).total
+            return first + self._rendered(method) + FINISH_SWEEPS * self.pace(FistaTv(), of_trial=True).each
+        return 0.0 if getattr(method, "trial_sweeps", 0) else self.of(method).most
 
 
 def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int = _ROWS) -> ReconProblem:
@@ -213,7 +217,7 @@ def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int =
     lines = np.sqrt(np.maximum((0.35 * width) ** 2 - across**2, 0)) / width
     noise = np.random.default_rng(0).standard_normal((views.n_views, height, width), np.float32)
     data: F32 = lines.astype(np.float32) + _NOISE * noise
-    return ReconProblem(data, views, box, DataUse(), 0, "cpu")
+    return ReconProblem(Views(data, views), box)
 
 
 def _work(geometry: Geometry, grid: Grid) -> float:

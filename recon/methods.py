@@ -31,6 +31,11 @@ REGISTRY: dict[str, MethodEntry] = {
     **in_folders("recon.features", "METHODS"),
 }
 
+_CANDIDATES: dict[str, float] = {"fbp": 0, "fista-tv": 1, "pnp-dct": 2, "r2": 3}
+_CANDIDATES |= in_folders("recon.features", "CANDIDATES")
+CANDIDATES = tuple(sorted(_CANDIDATES, key=lambda name: _CANDIDATES[name]))
+"""Names of the methods that `auto` tries, the simplest and cheapest first."""
+
 DEFAULT = "r2"  # The default method
 
 IN_TIME = next((name for name, entry in REGISTRY.items() if entry.several == "times"), None)

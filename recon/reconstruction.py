@@ -17,6 +17,7 @@ from recon.base.masks import RayWeights
 from recon.base.method import DataUse, Method, ReconProblem, RunControl, candidates_of, setting
 from recon.base.method import Reconstruction as Reconstruction
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
@@ -85,7 +86,9 @@ def reconstruct(
     grid = grid or Grid.matching(geometry)
     _warn_of_unseen_cone(chosen, geometry)
     begin = control.now()
-    result = run_in_box_of_sample(chosen, ReconProblem(data, geometry, grid, use, int(seed), device), control)
+    views = Views(data, geometry, use.weights)
+    problem = ReconProblem(views, grid, use, int(seed), device)
+    result = run_in_box_of_sample(chosen, problem, control)
     return replace(
         result, settings=dict(result.settings), method=result.method or chosen.name,
         seconds=result.seconds or control.now() - begin,

@@ -44,6 +44,7 @@ FOR_PACKAGES = {
     "beamline.scan.runs": ("newest",),
     "recon.base.method": ("Method", "ReconProblem", "Traits"),
     "recon.base.masks": ("masked",),
+    "recon.base.view_data": ("Views",),
     "recon.splatting.initialise": ("first_volume",),
     "recon.voxels.voxel_problem": ("density_unit",),
     "recon.testing": ("MethodConformance",),

@@ -20,7 +20,7 @@ from beamline.cli.options import (
 )
 from beamline.cli.recipe import METHOD, OUTPUT, RESOURCES, heading
 from beamline.core.errors import DataError
-from recon.assess.time_model import MODEL_STEPS, PRESETS, parse_budget
+from recon.assess.time_model import PRESETS, parse_budget
 from recon.base.choices import AUTO, KERNEL, Loss, Start
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.kernel import Kernel
@@ -163,8 +163,7 @@ _STEPS = option(
     setting="steps",
     excludes={"seconds": "give one of them", **_PLANNED},
     type=click.IntRange(min=1),
-    help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}; "
-    f"{MODEL_STEPS} where voxels alone predict held-out views as well.",
+    help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}.",
 )
 _GAUSSIANS = option(
     "--gaussians",

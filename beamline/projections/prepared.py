@@ -16,6 +16,7 @@ from recon.base.arrays import F32, I64
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights
 from recon.base.method import SampleRadius
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
 from recon.prep.correct import Projections
@@ -174,6 +175,22 @@ class PreparedProjections:
         moved = np.ptp(self.geometry.shifts[:, 1]) > 0
         return not self.geometry.is_cone and (bool(moved) or not self.geometry.is_straight)
 
+    @property
+    def views(self) -> Views:
+        """The views used, with weights that are computed where they are read."""
+        weights: Any = self.ray_factors()
+        return Views(self.projections.data, self.geometry, weights)
+
+    @property
+    def views_held_out(self) -> Views | None:
+        """The views held out, likewise; None where all are used."""
+        if self.held_out is None:
+            return None
+        data, geometry = self.held_out
+        weights, n = self.ray_factors(geometry.n_views), self.geometry.n_views
+        later: Any = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
+        return Views(data, geometry, later)
+
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
         """Weights [view, row, col] from `ray_factors`, read-only."""
         factors = self.ray_factors(others)
@@ -223,10 +240,9 @@ def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
     return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))
 
 
-Views = tuple[F32, Geometry]
-
-
-def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) -> tuple[F32, Geometry, list[int]]:
+def with_held_out(
+    projections: F32, geometry: Geometry, held_out: tuple[F32, Geometry] | None
+) -> tuple[F32, Geometry, list[int]]:
     """Used and held-out views as one set, and the numbers of the held-out views in it.
 
     The two geometries are of the same set-up.

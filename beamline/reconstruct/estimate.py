@@ -12,10 +12,10 @@ from beamline.core.machine import Need
 from beamline.core.text import count, size
 from beamline.projections.prepare import require_usable
 from beamline.projections.selection import check_axis, cone_of
-from beamline.reconstruct.measure import fit_truth
 from beamline.reconstruct.memory import recon_memory_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.plan import planned, refuse_before_reading
+from beamline.reconstruct.truth import fit_truth
 from beamline.storage.readers.base import ScanSource
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry

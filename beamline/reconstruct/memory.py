@@ -23,15 +23,13 @@ from recon.base.method import for_part as method_for_part
 from recon.base.registry import add_on_missing, plugins
 from recon.base.volume import Grid
 from recon.error_bars import HALO, error_bars_memory
+from recon.judgement import judge_memory
 from recon.voxels.direct import Fbp
-from recon.voxels.matter_checks import stray_mass_memory, unexplained_memory
-from recon.voxels.odd_views import odd_views_memory
 
 SHARE = 0.7  # Share of the free memory that a reconstruction takes by default
 
 _COPIES = 4  # float32 copies of a view while it is corrected
 _ROWS = 16  # slices: FBP makes so many together, and slabs are multiples of it
-_REGIONS, _REGION = 2**21, 12  # voxels at most of the regions that judge volumes (`metrics.sampled`); bytes of a voxel
 _NO_STEPS = StepMemory()
 _ASIDE = 64_000_000  # bytes of figures, and of steps that are alone, that are not counted
 
@@ -112,9 +110,7 @@ class ReconMemory:
     @property
     def figures(self) -> int:
         """Memory of the figures of merit for a volume on disk, without that of the program; FBP needs less."""
-        odd = 0 if self.method.traits.direct else odd_views_memory(self.geometry)
-        looks = unexplained_memory(self.geometry), stray_mass_memory(self.geometry, Grid.matching(self.geometry))
-        most = max(odd, _REGION * min(math.prod(Grid.matching(self.geometry).shape), _REGIONS), *looks)
+        most = judge_memory(self.geometry, fitted=not self.method.traits.direct)
         return most if most > _ASIDE else 0
 
     @property

@@ -28,7 +28,6 @@ from beamline.reconstruct.job import (
     with_error_bars,
 )
 from beamline.reconstruct.live_fit import ScanFollower
-from beamline.reconstruct.measure import fit_truth
 from beamline.reconstruct.options import FollowTiming, ReconOptions
 from beamline.reconstruct.plan import ReconPlan, prepare_within, refuse_before_reading
 from beamline.reconstruct.record import partly_seen_warning, write_result
@@ -36,6 +35,7 @@ from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.run import fit_within, refuse_views, warnings_told
 from beamline.reconstruct.scan_facts import ReportContext, ScanFacts, facts_of
 from beamline.reconstruct.slab_run import keeping
+from beamline.reconstruct.truth import fit_truth
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.open import NotReadyError, ScanSource
 from beamline.storage.recon_record import ReconRecord

@@ -23,7 +23,6 @@ from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import check_axis, cone_of
-from beamline.reconstruct.measure import read_truth
 from beamline.reconstruct.memory import (
     ReconMemory,
     cluster,
@@ -38,6 +37,7 @@ from beamline.reconstruct.options import (
 )
 from beamline.reconstruct.region import Region, locate
 from beamline.reconstruct.run import refuse_impossible, refuse_views
+from beamline.reconstruct.truth import read_truth
 from beamline.storage.disk_file import scratch_array
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.base import ScanSource

@@ -74,21 +74,20 @@ def write_result(
     Raises:
         DataError: the volume could not be written; none is left. A report that fails is a warning.
     """
-    phases = context.phases
+    phases, ordinary = context.phases, prepared.ordinary
     phases.enter("measuring the volume")
-    checked = check_volume(made, prepared.ordinary, truth, target, context, sink, clock)
+    checked = check_volume(made, ordinary, truth, target, context, sink, clock)
     remarks = [*checked.warnings, *([checked.skipped_text] if checked.skipped_text else [])]
-    stray = checked.stray.map if checked.stray is not None and checked.stray.share > 0 else None
-    context = replace(context, warnings=remarks, stray=stray)
-    record, volumes = _record(checked, prepared, context, clock.now())
+    context = replace(context, warnings=remarks)
+    record, volumes = _record(made, checked, prepared, target, context, clock.now())
     phases.enter("writing the volume")
     if target.written:
         write_volume(target.output, record, replace=target.replace)
     state_time: Callable[[float], None] | None = None  # on the page
-    if (page := target.report) is not None:
+    if target.report is not None:
         phases.enter("report")
         try:
-            state_time = _report(page, checked, volumes, record.parameters, context)
+            state_time = _report(made, ordinary, truth, checked, volumes, target, record.parameters, context)
         except Exception as error:  # the volume stands, whatever its page lacks
             said = f"There is no report: {type(error).__name__}: {error}. The volume is whole."
             sink(Warned(said, time=clock.now()))
@@ -104,9 +103,12 @@ def write_result(
 
 
 def _report(
-    page: Path,
+    made: Reconstruction,
+    prepared: PreparedProjections,
+    truth: Volume | None,
     checked: CheckedVolume,
     volumes: Mapping[str, Volume],
+    target: OutputPaths,
     parameters: Mapping[str, Value],
     context: ReportContext,
 ) -> Callable[[float], None]:
@@ -114,20 +116,22 @@ def _report(
     from beamline.reconstruct.report import compose  # here: matplotlib takes a second
     from beamline.report.html import write_report, write_timed
 
-    made, target = checked.made, checked.target
-    report = compose(
-        made, checked.prepared, checked.truth, volumes, checked.metrics, parameters, context, checked.unexplained
-    )
+    assert target.report is not None
+    report = compose(made, prepared, truth, volumes, checked, parameters, context)
     report = replace(report, volume=target.output.name if target.written else "")
-    write_report(page, report, replace=target.replace)
-    return partial(write_timed, page, report, label_of(made.method))
+    write_report(target.report, report, replace=target.replace)
+    return partial(write_timed, target.report, report, label_of(made.method))
 
 
 def _record(
-    checked: CheckedVolume, prepared: PreparedProjections, context: ReportContext, now: float
+    made: Reconstruction,
+    checked: CheckedVolume,
+    prepared: PreparedProjections,
+    target: OutputPaths,
+    context: ReportContext,
+    now: float,
 ) -> tuple[ReconRecord, dict[str, Volume]]:
     """The record of the volume, and the volumes of the report by method; of a region where one is wanted."""
-    made, target = checked.made, checked.target
 
     def written(volume: Volume) -> Volume:
         return prepared.stretched(volume if context.region is None else context.region.cut(volume))

@@ -10,6 +10,7 @@ import numpy as np
 from beamline.core.quantities import VoxelKind
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.scan_facts import ReportContext, as_text, label_of
+from beamline.reconstruct.volume_checks import CheckedVolume
 from beamline.report import pictures
 from beamline.report.history import (
     history_arrays,
@@ -25,7 +26,7 @@ from recon.base.method import Reconstruction
 from recon.base.views import spread
 from recon.base.volume import Volume, VolumeSeries
 from recon.methods import BASELINE
-from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, Unexplained
+from recon.voxels.matter_checks import UNEXPLAINED_LIMIT, StrayMass, Unexplained
 from recon.voxels.view_weights import Wedge, unseen_wedges
 
 _SHOWN, _UPRIGHT = 12, 8  # times at most; slices from which on upright cuts of them are drawn, too
@@ -37,12 +38,12 @@ def compose(
     prepared: PreparedProjections,
     truth: Volume | None,
     volumes: Mapping[str, Volume],
-    metrics: Mapping[str, Mapping[str, float]],
+    checked: CheckedVolume,
     parameters: Mapping[str, Value],
     context: ReportContext,
-    unexplained: Unexplained | None = None,
 ) -> Report:
-    """The report on a reconstruction; `unexplained` is the structure in its residual, if known."""
+    """The report on a reconstruction."""
+    metrics, judgement = checked.metrics, checked.judgement
     settings = {
         k: as_text(v) for k, v in parameters.items() if not isinstance(v, np.ndarray) and k not in ("command", "recipe")
     } | {f"law: {name}": left for name, left in prepared.laws.items()}
@@ -56,13 +57,13 @@ def compose(
         flags=[*context.facts.remarks, *context.warnings],
         pictures=[
             *(_slices(prepared, truth, volumes) if made.series is None else _several(made.series)),
-            *_doubts(made, prepared, unexplained),
+            *_doubts(made, prepared, judgement.unexplained),
             *_views(prepared),
-            *_further(made, prepared, context),
+            *_further(made, prepared, judgement.stray, context),
         ],
         command=context.command,
         recipe=context.recipe,
-        footnotes=_footnotes(made, truth, metrics, unexplained),
+        footnotes=_footnotes(made, truth, metrics, judgement.unexplained),
         live_picture=context.facts.live_picture,
     )
 
@@ -152,15 +153,17 @@ def _footnotes(
     return [text for concerns, text in footnotes if concerns]
 
 
-def _further(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> Iterator[Picture]:
+def _further(
+    made: Reconstruction, prepared: PreparedProjections, stray: StrayMass | None, context: ReportContext
+) -> Iterator[Picture]:
     """Stray mass, darks, flats and flagged frames, as far as there are any."""
     facts = context.facts
-    if context.stray is not None:
+    if stray is not None and stray.share > 0:
         yield Picture(
             "Stray mass",
             "The highest density above each other, of voxels that the views show to be empty. All of it is an "
             "artefact: less is better.",
-            pictures.stray_mass(context.stray, made.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
+            pictures.stray_mass(stray.map, made.volume.grid, prepared.length_unit, VoxelKind.ATTENUATION),
         )
     if facts.references:
         yield Picture(

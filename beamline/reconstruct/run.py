@@ -28,6 +28,7 @@ from recon.base.decisions import Stop
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, candidates_of
 from recon.base.slabs import Slab, part_of, slabs_of
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.error_bars import HALO, LEAST_VIEWS, ErrorBars, error_bars
 from recon.methods import by_name, with_settings, with_trait
@@ -226,7 +227,6 @@ def _bars(
 ) -> ErrorBars | None:  # fmt: skip
     # Rays that weigh nothing were filled on disk, as a direct method does it.
     weights = None if method.traits.direct and prepared.on_disk else prepared.ray_weights()
-    problem = ReconProblem(
-        prepared.projections.data, prepared.geometry, volume.grid, DataUse(weights), options.seed, options.device
-    )
+    views = Views(prepared.projections.data, prepared.geometry, weights)
+    problem = ReconProblem(views, volume.grid, seed=options.seed, device=options.device)
     return error_bars(method, problem, volume, decided, replace(control, decide=None))

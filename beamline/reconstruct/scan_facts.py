@@ -170,7 +170,6 @@ class ReportContext:
     Attributes:
         filter: of FBP, also of the one that the volume is compared with.
         leaves: whether there is time for so many seconds before the report.
-        stray: the map of mass where views show nothing [y, x]; None without any.
     """
 
     facts: ScanFacts
@@ -183,7 +182,6 @@ class ReportContext:
     region: RegionOfRows | None = None
     phases: Phases = field(default_factory=Phases)
     leaves: Callable[[float], bool] = lambda seconds: True
-    stray: NDArray[np.float32] | None = None
     filter: Filter = "hann"
 
 

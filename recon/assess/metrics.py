@@ -194,7 +194,7 @@ def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
     """
     box = inscribed_cuboid(volume.shape)
     values = volume[box]
-    if not all(np.isfinite(image).all() for image in values):
+    if not np.isfinite(values).all():
         raise ValueError("the volume holds NaN or infinite values")
     rng = np.random.default_rng(seed)
     some = tuple(rng.integers(0, n, _SAMPLE) for n in values.shape) if values.size > _SAMPLE else ...
@@ -203,8 +203,7 @@ def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
         raise ValueError(f"all voxels are {sample[0]:g}: there are no two regions to separate")
     threshold = _between_two_means(sample)
     mask = np.full(volume.shape, -1, np.int8)
-    for part, image in zip(mask[box], values, strict=True):
-        part[...] = image > threshold
+    mask[box] = values > threshold
     return mask
 
 
@@ -263,19 +262,12 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
     """
     if volume.shape != mask.shape:
         raise ValueError(f"the volume has shape {volume.shape}, the mask {mask.shape}")
-    dense, empty = (sum(int(np.count_nonzero(part == kind)) for part in mask) for kind in (1, 0))
-    if not dense or not empty:
-        raise ValueError(f"the mask marks {dense} dense and {empty} empty voxels; both are needed")
-
-    def mean_of(kind: int, off: float = 0.0, power: int = 1) -> float:
-        """Mean of a power of the values of a region, less `off`; slice by slice, in float64."""
-        images = zip(volume, mask, strict=True)
-        total = sum(float(((image[part == kind].astype(np.float64) - off) ** power).sum()) for image, part in images)
-        return total / (dense if kind else empty)
-
+    dense, empty = (volume[mask == kind] for kind in (1, 0))
+    if not dense.size or not empty.size:
+        raise ValueError(f"the mask marks {dense.size} dense and {empty.size} empty voxels; both are needed")
     with np.errstate(invalid="ignore"):
-        mean, base = mean_of(1), mean_of(0)
-        spread = math.sqrt(mean_of(0, base, 2))
+        mean, base = (float(each.mean(dtype=np.float64)) for each in (dense, empty))
+        spread = float(empty.std(dtype=np.float64))
     if not (math.isfinite(mean) and math.isfinite(spread)):
         raise ValueError("the volume holds NaN or infinite values")
 

@@ -7,10 +7,6 @@ from dataclasses import dataclass
 
 from recon.base.choices import Quality
 
-MODEL_STEPS = 50
-"""Of a fit whose volume voxels make. Without: no Gaussians beside such a volume."""
-
-
 MOST_STEPS = 1000
 """Of a fit within a time: further ones fit the noise, on four measured and simulated scans."""
 

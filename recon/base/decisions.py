@@ -1,13 +1,27 @@
-"""Decisions: numbers that a method derives from its data, kept so that other slabs of the same scan use them."""
+"""Decisions: what a method derives from its data, kept so that other slabs of the same scan use it."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 T = TypeVar("T")
+
+
+class Prior(NamedTuple):
+    """The prior of a volume.
+
+    Attributes:
+        weight: of total variation, μ of min ½||A x - p||² + μ TV(x).
+        strength: last threshold of sparse patches; 0: it was not sought.
+        patches: these predict views held out better than total variation alone.
+    """
+
+    weight: float
+    strength: float = 0.0
+    patches: bool = False
 
 
 class Decisions:
@@ -19,10 +33,12 @@ class Decisions:
 
     Attributes:
         made: so far, by name; plain numbers and lists of them.
+        prior: of the volume, in the units of the scan, where it was chosen before; None: the method decides.
     """
 
     def __init__(self, seed: int = 0, followed: Mapping[str, Sequence[Any]] | None = None) -> None:
         self.seed = seed
+        self.prior: Prior | None = None
         self.made: dict[str, list[Any]] = {}
         self._followed = followed or {}
 
@@ -32,12 +48,6 @@ class Decisions:
         made.append(before[len(made)] if len(made) < len(before) else decide())
         value: T = made[-1]
         return value
-
-    def preset(self, made: Mapping[str, Sequence[Any]]) -> None:
-        """Use these as the next decisions of their names, unless a followed run has made them."""
-        for name, values in made.items():
-            if len(self._followed.get(name, ())) <= len(self.made.get(name, ())):
-                self._followed = {**self._followed, name: [*self.made.get(name, ()), *values]}
 
 
 class Stop:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from recon.base.declared_types import Checked
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
 from recon.base.volume import Grid, Volume, VolumeSeries
+
+if TYPE_CHECKING:
+    from recon.base.view_data import Views
 
 Plain = str | int | float
 Clock = Callable[[], float]
@@ -57,11 +60,6 @@ class Progress:
 
 SWEEPS_OF_TRIALS = "sweeps of trials"
 """How `Progress.unit` of trials begins: a search goes on as long as it must, so that few scans take the most."""
-
-
-def sweeps_of_trials(trial: int, usual: int, most: int) -> tuple[int, str]:
-    """The planned number of trial sweeps once `trial` are done, and their unit."""
-    return (usual, f"{SWEEPS_OF_TRIALS} as a rule") if trial <= usual else (most, f"{SWEEPS_OF_TRIALS} at most")
 
 
 SAMPLE = "sample_radius"
@@ -165,20 +163,32 @@ def _never() -> bool:
 
 @dataclass(frozen=True, eq=False)
 class ReconProblem:
-    """The data and the grid of a reconstruction.
+    """The views and the grid of a reconstruction.
 
     Attributes:
-        projections: float32 [view, row, col], line integrals; values that are not finite are allowed.
+        views: line integrals, with the weights of their rays.
+        use: what else is known of the views, with their weights.
         wide: the grid holds a sample beyond the field.
     """
 
-    projections: F32
-    geometry: Geometry
+    views: Views
     grid: Grid
-    use: DataUse
-    seed: int
-    device: str
+    use: DataUse = DataUse()
+    seed: int = 0
+    device: str = "cpu"
     wide: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "use", replace(self.use, weights=self.views.weights))
+
+    @property
+    def projections(self) -> F32:
+        """The line integrals [view, row, col] of the views."""
+        return self.views.data
+
+    @property
+    def geometry(self) -> Geometry:
+        return self.views.geometry
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from pkgutil import iter_modules
@@ -127,13 +127,10 @@ class Registry(Mapping[str, T], Generic[T]):
         reserved: Collection[str] = (),
     ) -> None:
         self.kind, self.ours, self._made, self._reserved = kind, ours, made, reserved
-        self._all = dict[str, T]()
 
-    @property
-    def _entries(self) -> Mapping[str, T]:  # no cached_property, whose lock of Python 3.11 outlives a fork
-        if not self._all:
-            self._all = {**self.ours, **plugins(self.kind, (*self.ours, *self._reserved), self._made)}
-        return self._all
+    @cached_property
+    def _entries(self) -> Mapping[str, T]:
+        return {**self.ours, **plugins(self.kind, (*self.ours, *self._reserved), self._made)}
 
     def __getitem__(self, name: str) -> T:
         try:

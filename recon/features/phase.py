@@ -15,8 +15,9 @@ from recon.base.geometry import Geometry
 from recon.base.units import HC
 from recon.base.views import spread
 from recon.base.volume import Grid
+from recon.voxels.choice import exceeds_standard_error, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter
-from recon.voxels.held_out import LEAST_VIEWS, beyond_chance, predicted_views, preferred_strength
+from recon.voxels.held_out import LEAST_VIEWS, predicted_views
 from recon.voxels.methods import FistaTv
 
 _REACH = 4.0  # lengths: beyond, a pixel's influence is below exp(-4)
@@ -155,7 +156,7 @@ def length_by_held_out_views(
     near = (_FIRST * 2.0 ** (round(math.log2(best.strength / _FIRST)) + half) for half in (-0.5, 0.0, 0.5))
     at = min(near, key=lambda square: float(residuals_of(square).mean()))
     least, none = residuals_of(at), residuals_of(0.0)
-    if not beyond_chance(none - least, _ERRORS):
+    if not exceeds_standard_error(none - least, _ERRORS):
         return None
     weaker, stronger = (residuals_of(at * 2.0**half) - least for half in (-0.5, 0.5))
     # Half octaves to the vertex of a parabola, by each view; whole octaves would cost 1 dB.

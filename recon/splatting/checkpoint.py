@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +19,6 @@ from recon.splatting.settings import NAMES, FitSettings
 _GROUPS = ("parameters", "first", "second")
 _COUNTS = ("limit", "step", "seen")
 _SCALARS = ("unit", "loss", "residual")
-_DECIDED = "decided."  # names of arrays of decisions begin so
 _WORDS = 4  # 64-bit words: state and increment of PCG64
 
 
@@ -97,20 +96,6 @@ def _refuse_damaged(arrays: Mapping[str, NDArray[Any]]) -> None:
     for key in wanted:
         if not np.isfinite(arrays[key]).all():
             raise ValueError(f"{key} of the checkpoint holds values that are not finite")
-
-
-def decisions_of(made: Mapping[str, Sequence[Any]], names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """The first decisions of these names, numbers or lists of numbers, as arrays of a checkpoint."""
-    return {_DECIDED + name: np.array(made[name][0]) for name in names if made.get(name)}
-
-
-def decisions_from(arrays: Mapping[str, NDArray[Any]]) -> dict[str, list[Any]]:
-    """The inverse of `decisions_of`."""
-    decided = {name.removeprefix(_DECIDED): each for name, each in arrays.items() if name.startswith(_DECIDED)}
-    for name, values in decided.items():
-        if not np.isfinite(values).all():
-            raise ValueError(f"{name} of the checkpoint is {values.tolist()}, expected finite numbers")
-    return {name: [values.tolist()] for name, values in decided.items()}
 
 
 _BEST = "best."  # names of the best model's arrays in a checkpoint begin so

@@ -46,10 +46,6 @@ class FitMethod(Method, Protocol):
     def fit(self) -> FitSettings: ...
 
     @property
-    def by_content(self) -> bool:
-        """Whether held-out views decide if the fit is worthwhile, see `finish.judged`."""
-
-    @property
     def planned_steps(self) -> int | None:
         """Number of steps; None if a time ends the fit."""
 
@@ -57,15 +53,8 @@ class FitMethod(Method, Protocol):
     def made_by(self) -> tuple[FitSettings, Mapping[str, Plain]]:
         """All settings that determine the steps, which a resumed run must share, and more by name."""
 
-    def as_candidate(self) -> Self:
-        """The same fit, which makes its own volume whatever methods on voxels predict."""
-
     def for_trial(self, share: float, of_steps: float) -> Self:
         """The fit alone, of this share of the rows, with this share of the steps."""
-
-    @property
-    def least_steps(self) -> int | None:
-        """The fewest steps after which the data may end the fit; `planned_steps` if they cannot."""
 
     @property
     def finish_sweeps(self) -> int:

@@ -9,22 +9,23 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
-from recon.base.choices import Filter, Start
+from recon.base.choices import Start
 from recon.base.empirical import SMOOTHED, SPREAD, VOXELS_A_GAUSSIAN, WILD_PIXEL, WILD_VIEWS
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel
 from recon.base.masks import masked
+from recon.base.method import Method, ReconProblem, RunControl
+from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.slopes import slopes_at, windowed
 from recon.kernels.cpu.tv import total_variation
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import project
-from recon.voxels.direct import direct, has_direct_method
+from recon.voxels.direct import Fbp, has_direct_method
 from recon.voxels.field_edges import wider_than_field
-from recon.voxels.iterative import solve
 from recon.voxels.methods import OsSirtTv
-from recon.voxels.projector import Projector, volume_lines
+from recon.voxels.projector import volume_lines
 from recon.voxels.view_weights import angular_weights
 from recon.voxels.voxel_problem import density_unit, difference_weights
 
@@ -136,16 +137,15 @@ def first_volume(
     "tv": these sweeps in every case: slower, and free of streaks with few views. "published": as "fbp" with the plain
     ramp. The device is that of `direct` and of the sweeps.
     """
-    projections = without_wild_pixels(projections)
-    if _swept(geometry, start):
-        sweeps = OsSirtTv(iterations=START_SWEEPS, momentum=True)
-        return solve(sweeps, Projector(geometry, grid, device=device), projections)
-    ramp: Filter = "ram-lak" if start == "published" else "hann"
-    if geometry.is_cone:
-        return Volume(direct(projections, geometry, grid, ramp, device=device), grid)
+    swept = _swept(geometry, start)
+    sweeps = OsSirtTv(iterations=START_SWEEPS, momentum=True)
+    quick: Method = sweeps if swept else Fbp("ram-lak" if start == "published" else "hann")
+    problem = ReconProblem(Views(without_wild_pixels(projections), geometry), grid, device=device)
+    volume = quick.run(problem, RunControl()).volume
+    if swept or geometry.is_cone:
+        return volume
     # FBP of a part of the half circle is too small by that part, which would make the density unit too small.
-    whole = np.float32(np.pi / angular_weights(geometry.angles).sum())
-    return Volume(direct(projections, geometry, grid, ramp, device=device) * whole, grid)
+    return Volume(volume.data * np.float32(np.pi / angular_weights(geometry.angles).sum()), grid)
 
 
 def mean_change(

@@ -8,11 +8,12 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32, bin_views
+from recon.base.arrays import F32
 from recon.base.choices import Loss as Loss
 from recon.base.geometry import Geometry, require_views
 from recon.base.masks import masked
 from recon.base.noise import noise_level
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.kernels.cpu.losses import L1, L2, POISSON, DataTerm
 from recon.splatting.backend import Backend, ProjectionLoss
@@ -144,10 +145,8 @@ def binned_geometry(geometry: Geometry, factor: int) -> Geometry:
     return replace(geometry.binned(factor), axis_row=(geometry.axis_row - (factor - 1) / 2) / factor)
 
 
-def join_pixels(
-    projections: F32, weights: F32 | None, geometry: Geometry, factor: int
-) -> tuple[F32, F32 | None, Geometry]:
-    """Views [view, row, col], their weights and geometry with factor x factor pixels joined.
+def join_pixels(views: Views, factor: int) -> Views:
+    """Views with factor x factor pixels joined.
 
     A joined pixel is the weighted mean of its pixels and has their mean weight, so that unmeasured ones do not count.
 
@@ -155,12 +154,9 @@ def join_pixels(
         ValueError: as `binned_geometry`.
     """
     if factor == 1:
-        return projections, weights, geometry
-    binned = binned_geometry(geometry, factor)
-    if weights is None:
-        return bin_views(projections, factor), None, binned
-    sums, known = bin_views(weights * projections, factor), bin_views(weights, factor)
-    return np.divide(sums, known, out=np.zeros_like(sums), where=known > 0), known, binned
+        return views
+    geometry = binned_geometry(views.geometry, factor)
+    return views.binned(factor, geometry)
 
 
 def _with_views(problem: FitProblem, projections: F32, weights: F32 | None) -> FitProblem:

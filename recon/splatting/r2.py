@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
-from recon.assess.time_model import MODEL_STEPS, PRESETS
+from recon.assess.time_model import PRESETS
 from recon.base.choices import Quality, Start
 from recon.base.declared_types import Checked, Count, Natural, NonNegative
 from recon.base.empirical import DEFAULT_STEPS
@@ -21,7 +21,10 @@ from recon.splatting.initialise import default_count
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
+from recon.splatting.trial_fit import FIRST_SHARE, predict
+from recon.voxels.choice import Choice, Prediction
 from recon.voxels.methods import PnpDct
+from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import Buffers, bytes_of
 
 _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
@@ -32,9 +35,7 @@ class R2(Checked):
     """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
 
     Attributes:
-        steps: of the fit. 0 gives the starting point. None takes 400, or 50 where views held out say that voxels alone
-            predict as well: then they make the volume, see `finish.judged`. With `seconds` it takes as many as
-            fit.
+        steps: of the fit. 0 gives the starting point. None takes 400; with `seconds` it takes as many as fit.
         seconds: of the whole run, from the call to the volume: start, steps, finish and volume. The rates decay along
             it. It counts by the caller's clock, and with the time to compile where `warm_up` was not called. The
             start and one step are made in any case.
@@ -76,20 +77,6 @@ class R2(Checked):
         """Number of steps that end the fit; None if only `seconds` do."""
         return DEFAULT_STEPS if self.steps is None and self.seconds is None else self.steps
 
-    @property
-    def by_content(self) -> bool:
-        """Whether held-out views decide if the fit is worthwhile."""
-        given = self.steps is not None or self.seconds is not None or self.finish is not None
-        return not (given or self.early_stop or isinstance(self.gaussians, Gaussians))
-
-    @property
-    def least_steps(self) -> int | None:
-        return MODEL_STEPS if self.by_content else self.planned_steps
-
-    def as_candidate(self) -> Self:
-        """The fit that competes with methods on voxels: it is run, whatever they predict."""
-        return replace(self, steps=self.planned_steps) if self.by_content else self
-
     def for_trial(self, share: float, of_steps: float) -> Self:
         """The fit alone, of this share of the rows, with this share of the steps."""
         steps = None if self.planned_steps is None else round(of_steps * self.planned_steps)
@@ -101,6 +88,19 @@ class R2(Checked):
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return run_fit(self, problem, control)
+
+    @property
+    def trial_sweeps(self) -> int:
+        """Sweeps on voxels and steps of a trial, as a rule."""
+        refined = FINISH_SWEEPS + PnpDct.iterations
+        return PnpDct().trial_sweeps + round(FIRST_SHARE * (self.planned_steps or 0)) + refined
+
+    def predict(self, trial: Trial, so_far: Choice) -> Prediction:
+        """The prediction of a fit by steps with the usual finish; of another one that of its volume."""
+        other = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
+        if other or self.early_stop or trial.prior is None:
+            return trial.predicted(self)
+        return predict(self, trial, so_far, trial.prior)
 
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit of future views, from this number of Gaussians.

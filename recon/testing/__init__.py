@@ -26,6 +26,7 @@ from recon.base.method import (
     RunControl,
     Traits,
 )
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector
 
@@ -38,7 +39,7 @@ def problem() -> ReconProblem:
     """A small box of 0.2 /mm, off the axis."""
     truth = np.zeros(GRID.shape, np.float32)
     truth[BOX] = 0.2
-    return ReconProblem(Projector(VIEWS, GRID).plain.forward(truth), VIEWS, GRID, DataUse(), 3, "cpu")
+    return ReconProblem(Views(Projector(VIEWS, GRID).plain.forward(truth), VIEWS), GRID, seed=3)
 
 
 _WHOLE: dict[str, Reconstruction] = {}
@@ -83,7 +84,7 @@ class MethodConformance:
         given = problem()
         spoiled = given.projections.copy()
         spoiled[::5, 3, 4] = np.nan
-        found = method.run(replace(given, projections=spoiled), RunControl()).volume.data
+        found = method.run(replace(given, views=Views(spoiled, VIEWS)), RunControl()).volume.data
         assert np.isfinite(found).all()
         expected = whole(method).volume.data
         assert np.abs(found - expected).mean() < 0.2 * np.abs(expected).mean()

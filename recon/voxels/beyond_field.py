@@ -14,14 +14,16 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32, F64, bin_views
+from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
 from recon.base.empirical import LIGHT_WEIGHT
 from recon.base.geometry import Geometry
 from recon.base.masks import RayWeights, masked
-from recon.base.method import SAMPLE, DataUse, Method, ReconProblem, Reconstruction, RunControl, SampleRadius, Traits
+from recon.base.method import SAMPLE, Method, ReconProblem, Reconstruction, RunControl, SampleRadius, Traits
+from recon.base.view_data import Views
 from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
+from recon.voxels.choice import predicts_as_well
 from recon.voxels.field_edges import (
     busiest_rows,
     middle_of_cone,
@@ -30,14 +32,14 @@ from recon.voxels.field_edges import (
     taller_than_field,
     wider_than_field,
 )
-from recon.voxels.held_out import LEAST_VIEWS, beyond_chance, split_views, unseen_residuals
+from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.methods import FistaTv
-from recon.voxels.projector import Projector, projection_lines
+from recon.voxels.projector import Projector
+from recon.voxels.residuals import residuals_of
 
 _COLS, _ROWS, _VIEWS, _SWEEPS = 48, 4, 96, 16  # of a trial: columns and rows after binning, views, iterations
 _LOOKS = 8  # views by which rows are chosen
 _STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5  # ratios of radii: of the first search, of the second; at most
-_ERRORS = 1.0  # standard errors by which radii predict alike
 
 
 def run_in_box_of_sample(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
@@ -59,7 +61,7 @@ def run_in_box_of_sample(method: Method, problem: ReconProblem, control: RunCont
     data, views, grid = problem.projections, problem.geometry, problem.grid
 
     def measured() -> list[float]:
-        sample = sample_radius(data, views, problem.use.weights, problem.use.sample_radius)
+        sample = sample_radius(data, views, problem.views.weights, problem.use.sample_radius)
         return [] if sample is None else list(asdict(sample).values())
 
     sample = SampleRadius(*values) if (values := decide(SAMPLE, measured)) else None
@@ -175,11 +177,9 @@ def _predicting_radius(views: F32, geometry: Geometry, reach: float) -> SampleRa
         trial = _Trial.of(views, geometry, 2 * _COLS)
         tried.clear()
         least = best(_FINE ** (k / 2) for k in range(8))
-    if not beyond_chance(tried[1.0][0] - tried[least][0], _ERRORS):
+    if predicts_as_well(tried[1.0][0], tried[least][0]):
         return None
-    alike = [
-        ratio for ratio, (residuals, _) in tried.items() if not beyond_chance(residuals - tried[least][0], _ERRORS)
-    ]
+    alike = [ratio for ratio, (residuals, _) in tried.items() if predicts_as_well(residuals, tried[least][0])]
     radius = min(alike) * _FINE
     alike += [ratio for ratio in tried if abs(math.log(ratio / radius, _FINE)) < 1.5]
     densities = [tried[ratio][1] for ratio in alike]
@@ -220,31 +220,26 @@ class _Trial:
     """Some binned rows of the views, of which one in eight judges.
 
     Attributes:
-        seen, unseen: line integrals [view, row, col] and geometry of the views.
+        seen, unseen: views to reconstruct from, and those held out.
         box: of the field.
     """
 
-    seen: tuple[F32, Geometry]
-    unseen: tuple[F32, Geometry]
+    seen: Views
+    unseen: Views
     box: Grid
 
     @classmethod
     def of(cls, views: F32, geometry: Geometry, columns: int) -> _Trial:
-        factor = _factor(geometry, columns)
-        views, geometry = bin_views(views, factor), geometry.binned(factor)
-        box = Grid.matching(geometry)
+        binned = Views(views, geometry).binned(_factor(geometry, columns))
+        box = Grid.matching(binned.geometry)
         if not geometry.is_cone:
-            geometry, box = slab_of(geometry, box, 0, geometry.detector_shape[0])
-        fitted, judges = split_views(geometry)
-        return cls((views[fitted], geometry.select(fitted)), (views[judges], geometry.select(judges)), box)
+            geometry, box = slab_of(binned.geometry, box, 0, binned.geometry.detector_shape[0])
+            binned = Views(binned.data, geometry)
+        return cls(*binned.split(), box)
 
     def of_radius(self, radius: float) -> tuple[F64, float]:
         """Residual [view held out] of a box that reaches so far, and the mean density in the middle of the field."""
-        (data, geometry), (judged, apart) = self.seen, self.unseen
-        grid = self.box.reaching(radius, geometry)
+        grid = self.box.reaching(radius, self.seen.geometry)
         method = FistaTv(iterations=_SWEEPS, tv_weight=LIGHT_WEIGHT)
-        volume = method.run(ReconProblem(data, geometry, grid, DataUse(), 0, "cpu"), RunControl()).volume
-        projector = Projector(apart, grid)
-        model = projection_lines(projector.forward(volume.data))
-        residuals = unseen_residuals(model, projection_lines(judged), None, projector.resolution)
-        return residuals, _middle_density(volume, geometry.reach)
+        volume = method.run(ReconProblem(self.seen, grid), RunControl()).volume
+        return residuals_of(volume, self.unseen), _middle_density(volume, self.seen.geometry.reach)

@@ -17,7 +17,6 @@ from scipy import fft
 from recon.base.arrays import F32, F64
 from recon.base.declared_types import Checked
 from recon.base.geometry import Geometry, require_views
-from recon.base.masks import masked
 from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
@@ -312,13 +311,13 @@ class Fbp(Checked):
     filter: Filter = "hann"
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        filled = masked(problem.projections, problem.use.weights)[0]
+        filled = problem.views.masked().data
         begin, views = control.now(), problem.geometry.n_views
 
         def progress(done: int, slices: int) -> None:
             control.tell_part(done, slices, begin, views, "slices")
 
-        data = direct(filled, problem.geometry, problem.grid, self.filter, progress)
+        data = direct(filled, problem.geometry, problem.grid, self.filter, progress, device=problem.device)
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
 
     def toy(self) -> Self:

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, Self, runtime_checkable
+from typing import ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numba import get_num_threads, set_num_threads
@@ -22,13 +23,12 @@ from recon.base.arrays import F32
 from recon.base.decisions import Decisions
 from recon.base.declared_types import Checked, Count
 from recon.base.geometry import Geometry, require_views
-from recon.base.masks import masked
-from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, sweeps_of_trials
+from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.volume import Grid, Volume
-from recon.voxels.held_out import MOST_TRIALS
+from recon.voxels.choice import MOST_TRIALS
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 from recon.voxels.resolution import smoothed
-from recon.voxels.voxel_problem import Buffers, VoxelProblem, bytes_of
+from recon.voxels.voxel_problem import Buffers, Units, VoxelProblem, bytes_of, times_power
 
 UNITS = "units"  # name of the decision on them
 TV_WEIGHT_CHOSEN = "tv_weight_chosen"
@@ -69,6 +69,27 @@ class Watch:
 _UNWATCHED = Watch()
 
 
+class TrialWatch:
+    """Reports the sweeps of trials, and asks whether to stop them: `Watch.on_trial`.
+
+    Args:
+        usual: sweeps as a rule.
+    """
+
+    def __init__(self, control: RunControl, n_views: int, usual: int) -> None:
+        self._control, self._n_views, self._begin = control, n_views, control.now()
+        self._usual, self._done = usual, 0
+
+    def __call__(self) -> bool:
+        if self._control.stop_of_trials():
+            return True
+        self._done += 1
+        most = max(self._done, round(MOST_TRIALS * self._usual))
+        of, words = (self._usual, "as a rule") if self._done <= self._usual else (most, "at most")
+        self._control.tell_part(self._done, of, self._begin, self._n_views, f"{SWEEPS_OF_TRIALS} {words}")
+        return False
+
+
 def solve(
     method: IterativeMethod,
     projector: Projector,
@@ -96,32 +117,44 @@ def solve(
         ValueError: for shapes that disagree, values that are not finite, weights below zero or all zero, projections
             that are zero everywhere.
     """
-    data, rays = _checked(projector, projections, weight)
-    lines = _start(projector, start)
-    decide = decide or Decisions()
-    units = _Units(*decide(UNITS, lambda: _Units.of(projector, data, rays)))
-    inside = units.enter(projector, data, rays, lines)
-    at_voxels = smoothed(data, inside.resolution, None if rays is None else rays > 0)
+    problem, lines = entered(projector, projections, weight, start, nonnegative, watch, decide or Decisions())
+    with threads_for(projector.grid):
+        found = method.iterate(problem, lines)
+    return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
 
-    problem = VoxelProblem(
-        inside,
-        at_voxels,
-        rays,
-        nonnegative,
-        np.random.default_rng(decide.seed),
-        lambda iteration, residual: not watch.on_iteration(iteration, residual),
-        decide,
-        lambda: not watch.on_trial(),
-        measured=None if at_voxels is data else data,
-    )
+
+@contextmanager
+def threads_for(grid: Grid) -> Iterator[None]:
+    """A context of as many threads as have work enough, of a single slice few."""
     threads = get_num_threads()
     try:
-        if projector.grid.shape[0] == 1:
-            set_num_threads(max(1, min(threads, lines.size // _SHARE)))
-        found = method.iterate(problem, lines)
+        if grid.shape[0] == 1:
+            set_num_threads(max(1, min(threads, math.prod(grid.shape) // _SHARE)))
+        yield
     finally:
         set_num_threads(threads)
-    return Volume(volume_slices(_times_power(found, units.density)), projector.grid)
+
+
+def entered(
+    projector: Projector, projections: F32, weight: F32 | None, start: Volume | None, nonnegative: bool, watch: Watch,
+    decide: Decisions,
+) -> tuple[VoxelProblem, F32]:  # fmt: skip
+    """The problem of these views in units of about one, and the first volume [y, x, z]; arguments as of `solve`."""
+    data, rays = _checked(projector, projections, weight)
+    lines = _start(projector, start)
+    units = Units(*decide(UNITS, lambda: Units.of(projector, data, rays)))
+    times_power(data, -units.integral)
+    times_power(lines, -units.density)
+    if rays is not None:
+        times_power(rays, -units.weight)
+    inside = units.projector(projector)
+    at_voxels = smoothed(data, inside.resolution, None if rays is None else rays > 0)
+    problem = VoxelProblem(
+        inside, at_voxels, rays, nonnegative, np.random.default_rng(decide.seed),
+        lambda iteration, residual: not watch.on_iteration(iteration, residual), decide, lambda: not watch.on_trial(),
+        measured=None if at_voxels is data else data, units=units,
+    )  # fmt: skip
+    return problem, lines
 
 
 @dataclass(frozen=True)
@@ -158,15 +191,8 @@ class VoxelMethod(Checked, ABC):
         Raises:
             ValueError: as `solve`.
         """
-        begin, views, trial = control.now(), problem.geometry.n_views, 0
+        begin, views = control.now(), problem.geometry.n_views
         history: list[Progress] = []
-
-        def on_trial() -> bool:
-            nonlocal trial
-            trial += 1
-            of, unit = sweeps_of_trials(trial, self.trial_sweeps, round(MOST_TRIALS * self.trial_sweeps))
-            control.tell_part(trial, of, begin, views, unit)
-            return control.stop_of_trials()
 
         def report(iteration: int, residual: float) -> bool:
             seconds, planned = control.now() - begin, self.first_sweeps + self.iterations
@@ -174,64 +200,15 @@ class VoxelMethod(Checked, ABC):
             control.tell(history[-1])
             return control.stop()
 
-        filled, known = masked(problem.projections, problem.use.weights)
+        given = problem.views.masked()
         decide, settings = control.decide or Decisions(problem.seed), asdict(self)
+        watch = Watch(report, TrialWatch(control, views, self.trial_sweeps))
         volume = solve(
-            self, Projector(problem.geometry, problem.grid, device=problem.device), filled, weight=known,
-            nonnegative=not settings["allow_negative"], watch=Watch(report, on_trial), decide=decide,
+            self, Projector(problem.geometry, problem.grid, device=problem.device), given.data, weight=given.weights,
+            nonnegative=not settings["allow_negative"], watch=watch, decide=decide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
         return Reconstruction(volume, {**settings, **chosen, "seed": problem.seed}, tuple(history))
-
-
-def prior_decisions(made: Mapping[str, Sequence[Any]]) -> dict[str, Sequence[Any]]:
-    """Decisions on the prior that hold for other methods on the same views, with their units.
-
-    A weight by the noise does not, since it follows from sums over a volume, nor one that was given, which is a number.
-    """
-    weight = (made.get("weight") or [None])[0]
-    if not (isinstance(weight, list) and len(weight) == 1):
-        return {}
-    return {name: made[name][:1] for name in (UNITS, "weight", "strength") if made.get(name)}
-
-
-class _Units(NamedTuple):
-    """Powers of two near the lengths, line integrals and weights of the data: changing to these units is exact."""
-
-    length: int
-    integral: int
-    weight: int
-
-    @classmethod
-    def of(cls, projector: Projector, data: F32, rays: F32 | None) -> _Units:
-        largest = max(float(data.max()), -float(data.min()))
-        weight = 1.0 if rays is None else float(rays.max())
-        return cls(*(math.frexp(size)[1] for size in (projector.grid.voxel_size, largest, weight)))
-
-    @property
-    def density(self) -> int:
-        return self.integral - self.length
-
-    def enter(self, projector: Projector, data: F32, rays: F32 | None, lines: F32) -> Projector:
-        """The projector in these units; the arrays change to them in place."""
-        _times_power(data, -self.integral)
-        _times_power(lines, -self.density)
-        if rays is not None:
-            _times_power(rays, -self.weight)
-        views, box = projector.geometry, projector.grid
-        edge, slices = (math.ldexp(n, -self.length) for n in (box.voxel_size, box.spacing[0]))
-        z, y, x = (math.ldexp(n, -self.length) for n in box.centre)
-        grid = Grid(box.shape, edge, (z, y, x), slices)
-        return replace(projector, geometry=views.scaled(math.ldexp(1.0, -self.length)), grid=grid)
-
-
-def _times_power(array: F32, power: int) -> F32:
-    """array *= 2^power, in steps within float32's range."""
-    while power:
-        step = min(max(power, -100), 100)
-        array *= np.float32(2.0**step)
-        power -= step
-    return array
 
 
 def _checked(projector: Projector, projections: F32, weight: F32 | None) -> tuple[F32, F32 | None]:

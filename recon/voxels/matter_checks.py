@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from recon.base.arrays import F32, Mask
+from recon.base.arrays import F32, Mask, bin_views
 from recon.base.geometry import Geometry
-from recon.base.masks import RayWeights, masked
+from recon.base.masks import masked
 from recon.base.noise import air_level, noise_level, ring_offsets
 from recon.base.slabs import part_of
+from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.voxels.fbp import fbp, fbp_memory, is_gridded
@@ -39,14 +40,13 @@ class StrayMass:
     """Mass of a volume in the voxels that views show to be empty.
 
     Attributes:
-        empty: share of the voxels that are shown to be empty.
-        share: of the volume's mass that lies in them, counting densities above a twentieth of the density unit.
+        share: of the volume's mass that lies in the voxels that are shown to be empty, counting densities above a
+            twentieth of the density unit.
         map: float32 [y, x], the highest density above each other in these voxels.
         first: number of the first slice that was looked at.
         air: bool [slice, y, x], those of these voxels that every view looked at sees: beyond, FBP means nothing.
     """
 
-    empty: float
     share: float
     map: F32
     first: int
@@ -60,35 +60,28 @@ class StrayMass:
         return float(values.mean(dtype=np.float64)), float(values.std(dtype=np.float64))
 
 
-def stray_mass(
-    volume: Volume, projections: F32, geometry: Geometry, weights: F32 | RayWeights | None = None
-) -> StrayMass | None:
-    """Density in the voxels that views show to be empty; of a large volume, in slices around its middle.
-
-    Args:
-        volume: of any method.
-        weights: of rays [view, row, col]; rays of weight 0 show nothing.
+def stray_mass(volume: Volume, views: Views) -> StrayMass | None:
+    """Density in the voxels that views show to be empty; of a large volume, of any method, in slices around its middle.
 
     Returns:
         None if no voxel is shown to be empty, the volume holds no matter, or it is large and its slices are no rows.
     """
-    nz, looked_at, first = volume.grid.shape[0], _looked_at(geometry, volume.grid), 0
+    nz, looked_at, first = volume.grid.shape[0], _looked_at(views.geometry, volume.grid), 0
     if looked_at == 0:
         return None
     if nz > looked_at:
         first = (nz - looked_at) // 2
         band = slice(first, first + looked_at)
-        geometry, projections = geometry.rows(band.start, band.stop), projections[:, band]
-        weights = None if weights is None else weights[:, band]
-        volume = Volume(np.ascontiguousarray(volume.data[band]), Grid.matching(geometry))
-    empty, by_all = _empty_and_seen(projections, geometry, volume.grid, weights)
+        views = views.rows(band)
+        volume = Volume(np.ascontiguousarray(volume.data[band]), Grid.matching(views.geometry))
+    empty, by_all = seen_empty(views, volume.grid)
     matter = np.maximum(volume.data, 0)
     positive = matter[matter > 0]
     if not empty.any() or not positive.size:
         return None
     stray = np.where(empty & (matter > _FAINT * np.percentile(positive, _MATTER)), matter, 0)
     share = float(stray.sum(dtype=np.float64) / matter.sum(dtype=np.float64))
-    return StrayMass(float(empty.mean()), share, stray.max(axis=0), first, empty & by_all)
+    return StrayMass(share, stray.max(axis=0), first, empty & by_all)
 
 
 def stray_mass_memory(geometry: Geometry, grid: Grid) -> int:
@@ -112,30 +105,25 @@ def _looked_at(geometry: Geometry, grid: Grid) -> int:
     return nz if nz * slice_ <= _MOST_WHOLE else 0
 
 
-def seen_empty(projections: F32, geometry: Geometry, grid: Grid, weights: F32 | RayWeights | None = None) -> Mask:
-    """[z, y, x] voxels whose rays in at least two of up to 24 views meet no matter.
+def seen_empty(views: Views, grid: Grid) -> tuple[Mask, Mask]:
+    """Voxels whose rays in at least two of up to 24 views meet no matter, and those that are on the detector in all of
+    these views, [z, y, x] each.
 
     A ray meets none where its line integral, blurred by a pixel, is within four standard deviations of the noise, or
     within 0.5 % of the thick parts. So matter much thinner than that counts as none.
     """
-    return _empty_and_seen(projections, geometry, grid, weights)[0]
-
-
-def _empty_and_seen(
-    projections: F32, geometry: Geometry, grid: Grid, weights: F32 | RayWeights | None
-) -> tuple[Mask, Mask]:
-    """The voxels of `seen_empty`, and those that are on the detector in all of these views, [z, y, x] each."""
+    projections, geometry, weights = views.data, views.geometry, views.weights
     some = spread(np.arange(geometry.n_views), _VIEWS)
     data, known = masked(projections[some], None if weights is None else weights[some])
     noise = noise_level(data) / (2 * math.sqrt(math.pi) * _BLUR)  # after the blur
     limit = max(_SIGMAS * noise, _LEAST * float(np.percentile(data, 99)))
-    views = replace(geometry.select(some), skew=0.0) if geometry.skew else geometry.select(some)
+    geometry = replace(geometry.select(some), skew=0.0) if geometry.skew else geometry.select(some)
     votes, by_all = np.zeros(grid.shape, np.int16), np.ones(grid.shape, bool)
     for view, image in enumerate(data):
         air = gaussian_filter(image, _BLUR) < limit
         if known is not None:
             air &= known[view] > 0
-        one = Projector(views.select([view]), grid)
+        one = Projector(geometry.select([view]), grid)
         through_all = one.adjoint(np.ones((1, *air.shape), np.float32))
         by_all &= through_all > 0
         if not air.any():
@@ -174,13 +162,7 @@ class Unexplained:
     significance: F32
 
 
-def unexplained(
-    volume: Volume,
-    projections: F32,
-    geometry: Geometry,
-    rng: np.random.Generator,
-    weights: F32 | RayWeights | None = None,
-) -> Unexplained | None:
+def unexplained(volume: Volume, seen: Views, rng: np.random.Generator) -> Unexplained | None:
     """Filtered back-projection of the residual p - A x, over its noise: that of the views with random signs.
 
     Random signs of the views cancel structure, which all views share, and keep noise [our own; after the odd-even
@@ -189,13 +171,14 @@ def unexplained(
 
     Args:
         volume: on the slices of the detector rows, 1/mm.
-        weights: of the rays; rays of weight 0 were not measured, and are not used.
+        seen: the views.
 
     Returns:
         None for cones, rolled or tilted views, fewer than 16 views, other slices, or a volume without matter.
     """
-    slices, same = volume.grid.shape[0], volume.grid == Grid.matching(geometry)
-    if geometry.is_cone or not geometry.is_straight or geometry.n_views < _LEAST_VIEWS or not same:
+    geometry, slices = seen.geometry, volume.grid.shape[0]
+    rows_differ = geometry.is_cone or not geometry.is_straight or volume.grid != Grid.matching(geometry)
+    if rows_differ or geometry.n_views < _LEAST_VIEWS:
         return None
     n = min(_rows_looked_at(geometry), slices)
     mass = np.array([np.maximum(image, 0).sum(dtype=np.float64) for image in volume.data])
@@ -203,18 +186,17 @@ def unexplained(
     first = min(max(middle - n // 2, 0), slices - n)
     if geometry.climbs:  # few views see the slices in between
         at = volume.grid.coordinates()[0] / geometry.pixel_pitch + geometry.axis_row
-        seen = np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid")
-        first = int(seen.argmax())
+        first = int(np.convolve(mass * seen_by(geometry, at).sum(axis=0), np.ones(n), "valid").argmax())
     rows, views, box = part_of(geometry, volume.grid, slice(first, first + n))
     part = Volume(np.ascontiguousarray(volume.data[first : first + n]), box)
     level = _DENSE * float(np.percentile(part.data, 99))
     matter = np.stack([ndimage.binary_closing(image > level, iterations=_CLOSED) for image in part.data])
     if level <= 0 or not matter.any():
         return None
-    measured, projector = projections[:, rows], Projector(views, part.grid)
+    measured, projector = seen.data[:, rows], Projector(views, part.grid)
     unseen = np.broadcast_to(~seen_rays(views, part.grid), measured.shape)
-    if weights is not None:
-        unseen = unseen | (weights[:, rows] == 0)
+    if seen.weights is not None:
+        unseen = unseen | (seen.weights[:, rows] == 0)
     lines = np.where(unseen, np.float32(0), measured).swapaxes(1, 2)  # at the resolution of voxels, as the model is
     left = at_voxel_resolution(lines, projector.resolution, ~unseen.swapaxes(1, 2)).swapaxes(1, 2)
     left = left - projector.forward(part.data)
@@ -277,15 +259,15 @@ _BESIDE = 2  # blocks beside slices without beam that these are smoothed into
 
 @dataclass(frozen=True)
 class LostMatter:
-    """The matter that FBP of the same views shows, but a volume lacks.
+    """The largest region whose matter FBP of the same views shows, but a volume lacks.
 
     Attributes:
-        lost: (z, y, x), first and end, of the largest region that lost its matter; None: no region lost any.
+        region: (z, y, x), first and end.
         kept: mass in that region over the mass in FBP, each above its own air.
     """
 
-    lost: tuple[tuple[int, int], tuple[int, int], tuple[int, int]] | None = None
-    kept: float = 1.0
+    region: tuple[tuple[int, int], ...]
+    kept: float
 
 
 def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = None) -> LostMatter | None:
@@ -300,7 +282,7 @@ def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = No
         seen: [z], slices of rows that got beam, which alone are compared: in others FBP shows a filling. None: all.
 
     Returns:
-        None if the reference shows no air.
+        None if no region lost any, or the reference shows no air.
     """
     factor = max(1, math.ceil(max(volume.shape) / _BLOCKS))
     factor = min(factor, *volume.shape)
@@ -322,25 +304,21 @@ def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = No
     if noise == 0 or air.sum() < _LEAST_AIR:
         return None
     own = float(found[air].mean(dtype=np.float64))
-    comparison = LostMatter()
     gone = matter & (found - own < _LEFT * (shown - level))
     core = [min(n, wide) for n, wide in zip(gone.shape, _CORE, strict=True)]
     parts, n = ndimage.label(ndimage.binary_opening(gone, np.ones(core)))
     sizes = np.bincount(parts.ravel())[1:]
     if not n or sizes.max() < _LEAST_REGION:
-        return comparison
+        return None
     at = int(sizes.argmax())
     region = parts == at + 1
     kept = float((found[region] - own).sum(dtype=np.float64) / (shown[region] - level).sum(dtype=np.float64))
-    spans = tuple((part.start * factor, part.stop * factor) for part in ndimage.find_objects(parts)[at])
-    return LostMatter((spans[0], spans[1], spans[2]), kept)
+    return LostMatter(
+        tuple((part.start * factor, part.stop * factor) for part in ndimage.find_objects(parts)[at]), kept
+    )
 
 
 def _blocks(volume: F32, factor: int) -> F32:
     """Means of blocks of so many voxels a side; voxels at the ends that do not fill a block are dropped."""
-    nz, ny, nx = (n // factor for n in volume.shape)
-    blocks = np.empty((nz, ny, nx), np.float32)
-    for z in range(nz):
-        image = volume[z * factor : (z + 1) * factor, : ny * factor, : nx * factor].mean(axis=0, dtype=np.float32)
-        blocks[z] = image.reshape(ny, factor, nx, factor).mean(axis=(1, 3))
-    return blocks
+    layers = (volume[z : z + factor].mean(axis=0, dtype=np.float32) for z in range(0, len(volume) - factor + 1, factor))
+    return np.concatenate([bin_views(layer[None], factor) for layer in layers])

@@ -24,14 +24,16 @@ from recon.base.arrays import F32, bin_views
 from recon.base.decisions import Decisions
 from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
+from recon.base.view_data import split_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.beyond_field import offset_error, sample_radius
+from recon.voxels.choice import preferred_strength
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
-from recon.voxels.held_out import preferred_strength, split_views, unseen_residuals
 from recon.voxels.iterative import IterativeMethod, solve
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector, projection_lines
+from recon.voxels.residuals import unseen_residuals
 from recon.voxels.resolution import at_voxel_resolution
 from recon.voxels.voxel_problem import VoxelProblem
 

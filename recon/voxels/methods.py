@@ -6,26 +6,21 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
-from recon.base.arrays import F32, F64
-from recon.base.decisions import GoesOn
+from recon.base.arrays import F32
+from recon.base.decisions import GoesOn, Prior
 from recon.base.declared_types import Count, Natural, NonNegative
-from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD
+from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.geometry import Geometry
 from recon.base.method import Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
-from recon.voxels.held_out import (
-    CHOICE_SWEEPS,
-    TRIAL_SWEEPS,
-    TRIALS,
-    HeldOutTrial,
-    choose_weight,
-    preferred_strength,
-)
+from recon.voxels.choice import TRIALS, Choice, Prediction
+from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
-from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct
+from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
+from recon.voxels.trial import PATCH_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
     Buffers,
     Momentum,
@@ -68,11 +63,17 @@ class FistaTv(VoxelMethod):
         """Sweeps of the trials that choose the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
+    def predict(self, trial: Trial, so_far: Choice) -> Prediction:
+        """The prediction with the best weight; with one of its own that of the method's volume."""
+        if self.tv_weight is not None or trial.weight is None:
+            return trial.predicted(self)
+        return trial.prediction(self.name, trial.of_weight(trial.weight), Prior(trial.weight))
+
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         return self.with_weight(problem, x)[0]
 
     def with_weight(
-        self, problem: VoxelProblem, x: F32, trial: Callable[[], HeldOutTrial | None] | None = None
+        self, problem: VoxelProblem, x: F32, trial: Callable[[], Trial | None] | None = None
     ) -> tuple[F32, NoiseBalance | float]:
         """The volume after the iterations, and the weight μ; `trial` as in `choose_weight`."""
         projector = problem.projector
@@ -176,7 +177,7 @@ class PnpDct(VoxelMethod):
     traits: ClassVar[Traits] = Traits(device=True, halo=16, own_length=True, error_bars=(2.3, 0.25))
     buffers: ClassVar[Buffers] = Buffers(5.3, 3.0, 2.2)
 
-    iterations: Count = 35
+    iterations: Count = PATCH_STEPS
     patch_threshold: NonNegative | None = None
     allow_negative: bool = False
 
@@ -192,9 +193,15 @@ class PnpDct(VoxelMethod):
         """Steps with patches of a trial: as many as of the volume, and the usual number at most."""
         return min(self.iterations, PnpDct.iterations)
 
+    def predict(self, trial: Trial, so_far: Choice) -> Prediction:
+        """The prediction with the best threshold; with one of its own that of the method's volume."""
+        if self.patch_threshold is not None or trial.prior is None:
+            return trial.predicted(self)
+        return trial.prediction(self.name, trial.of_patches(trial.prior.strength), trial.prior)
+
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         first, sweeps = GoesOn(problem.go_on), 0 if x.any() else self.first_sweeps
-        trial = cache(partial(HeldOutTrial.of, problem))
+        trial = cache(partial(Trial.of, problem))
         weight: NoiseBalance | float
         if sweeps:
             x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
@@ -217,52 +224,3 @@ class PnpDct(VoxelMethod):
         trials = bytes_of(Buffers(1.0, 2.2, 2.2), geometry, grid, weighted)
         first = FistaTv().memory(geometry, grid, weighted) + trials
         return max(first, patches)
-
-
-class Patches(NamedTuple):
-    """The settings of sparse patches chosen by held-out views.
-
-    Attributes:
-        strength: of `pnp_dct`.
-        better: patches predict these views better than total variation alone.
-    """
-
-    strength: float
-    better: bool
-
-
-def choose_patches(
-    problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], HeldOutTrial | None], steps: int
-) -> Patches:
-    """The strength of `pnp_dct` chosen by held-out views, from volumes of total variation with a weight μ.
-
-    Trials take as many steps as the volume will: noise enters with each, so that few steps prefer a weaker prior.
-
-    The search begins at the noise that a volume of all views has without a prior. That is also the strength where no
-    views can be held out. There total variation is taken to predict as well. Neither knows of the densest matter: weak
-    matter beside metal keeps its detail.
-    """
-
-    def chosen() -> list[float]:
-        judge = None if isinstance(weight, NoiseBalance) else trial()
-        first = FIRST_THRESHOLD * noise_of_volume(problem if judge is None else judge.problem)
-        if judge is None or isinstance(weight, NoiseBalance) or first == 0:
-            return [first, 0]
-        smooth = judge.with_weight(weight) if judge.smooth is None else judge.smooth
-        found = preferred_strength(partial(residuals_of_patches, judge, smooth, steps), first)
-        if found is None:
-            return [first, 0]
-        judge.remember("patches", found)
-        return [found.strength, found.residuals.mean() < judge.of_weight(weight).mean()]
-
-    strength, better = problem.decide("strength", chosen)
-    return Patches(strength, bool(better))
-
-
-def residuals_of_patches(trial: HeldOutTrial, x: F32, steps: int, strength: float) -> F64:
-    """Residuals of held-out views for the volume that so many steps with patches make of `x`."""
-
-    def made(strength: float) -> F32:
-        return trial.volume_by(lambda part, first: pnp_dct(part, first, strength, steps=steps), x)
-
-    return trial.residuals_of("patches", strength, made)

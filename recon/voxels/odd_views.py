@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter, label, uniform_filter
 
-from recon.base.arrays import F32
+from recon.base.arrays import F32, bin_views
 from recon.base.geometry import Geometry
-from recon.base.masks import RayWeights
 from recon.base.noise import deviation_between_neighbours
 from recon.base.slabs import part_of
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.projector import Projector, project, projection_images, volume_lines
 
@@ -50,11 +50,7 @@ class OddView:
 
 
 def odd_views(
-    volume: Volume,
-    projections: F32,
-    geometry: Geometry,
-    weights: F32 | RayWeights | None = None,
-    progress: Callable[[int, int], None] = lambda done, of: None,
+    volume: Volume, views: Views, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> tuple[OddView, ...]:
     """Views in which something crossed the beam or the sample was displaced, found in the differences p - A x.
 
@@ -65,18 +61,16 @@ def odd_views(
     crack parallel to the rays is sharp in few views only [our own].
 
     Args:
-        weights: of the rays [view, row, col]; those of weight 0 were not measured.
         progress: how many of how many views were compared, of bands of rows by their share.
 
     Returns:
         In the order of the views; empty for fewer than 25 views.
     """
-    n = geometry.n_views
+    n, side = views.geometry.n_views, _side(views.geometry)
     if n < _LEAST_VIEWS:
         return ()
-    order = np.argsort(geometry.angles, kind="stable")
-    side = _side(geometry)
-    differences, edges = (each[order] for each in _differences(volume, projections, geometry, weights, side, progress))
+    order = np.argsort(views.geometry.angles, kind="stable")
+    differences, edges = (each[order] for each in _differences(volume, views, side, progress))
     found = []
     for place in range(n):
         first = min(max(place - _AROUND, 0), n - _LEAST_VIEWS)
@@ -122,8 +116,9 @@ def _projected(volume: Volume, geometry: Geometry) -> Iterator[tuple[slice, slic
             model = projection_images(Projector(geometry.select(some), volume.grid).forward_lines(lines))
             yield some, slice(0, rows), model, _sharp(model)
         return
-    for first in range(0, rows, band):
-        part = slice(first, min(first + band, rows))
+    whole = rows - rows % _side(geometry)  # rows at the end that fill no cell do not count
+    for first in range(0, whole, band):
+        part = slice(first, min(first + band, whole))
         around = slice(max(first - _BLUR, 0), min(part.stop + _BLUR, rows))
         _, views, grid = part_of(geometry, volume.grid, around)
         every = project(Volume(volume.data[around], grid), views)
@@ -138,34 +133,28 @@ def _sharp(models: F32) -> F32:
     return np.abs(models - gaussian_filter(models, (0, 1, 1), truncate=_BLUR))
 
 
-def _differences(
-    volume: Volume,
-    projections: F32,
-    geometry: Geometry,
-    weights: F32 | RayWeights | None,
-    side: int,
-    progress: Callable[[int, int], None],
-) -> tuple[F32, F32]:
+def _differences(volume: Volume, whole: Views, side: int, progress: Callable[[int, int], None]) -> tuple[F32, F32]:
     """The difference of the views from the volume, and its part that edges explain.
 
     [view, cell, cell] each, averaged over cells, in standard deviations of noise.
     """
+    projections, geometry, weights = whole.data, whole.geometry, whole.weights
     rows, cols = (n // side for n in geometry.detector_shape)
     # Means over cells: the difference in light, its part explained by edges, the known pixels, the view in light, the
     # light, and the difference.
     cells, edges, lit, seen, light, left = (np.zeros((geometry.n_views, rows, cols), np.float32) for _ in range(6))
-    compared, all_rows = 0, geometry.n_views * geometry.detector_shape[0]
+    compared = 0
     for views, part, model, sharp in _projected(volume, geometry):
         measured = projections[views, part]
         difference = measured - model
         known = np.ones_like(model) if weights is None else (weights[views, part] > 0).astype(np.float32)
         bright = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known
         there = views, slice(part.start // side, part.stop // side)
-        cells[there], lit[there] = _cells(difference * bright, side), _cells(known, side)
-        seen[there], light[there] = _cells(measured * bright, side), _cells(bright, side)
-        left[there], edges[there] = _cells(difference * known, side), _cells(sharp * bright, side)
+        cells[there], lit[there] = bin_views(difference * bright, side), bin_views(known, side)
+        seen[there], light[there] = bin_views(measured * bright, side), bin_views(bright, side)
+        left[there], edges[there] = bin_views(difference * known, side), bin_views(sharp * bright, side)
         compared += len(model) * model.shape[1]
-        progress(compared * geometry.n_views // all_rows, geometry.n_views)
+        progress(min(compared // (rows * side), geometry.n_views), geometry.n_views)
     for view, (cell, edge) in enumerate(zip(cells, edges, strict=True)):
         own = deviation_between_neighbours(seen[view], 3)  # the finest detail of the sample counts as noise
         noise = max(own, _LEAST_NOISE / side * float(np.abs(seen[view]).max()))
@@ -179,10 +168,3 @@ def _differences(
         cell[...] = uniform_filter(cell, _BROAD, mode="constant") * scale
         edge[...] = uniform_filter(_SHARP * edge, _BROAD, mode="constant") * scale
     return cells, edges
-
-
-def _cells(images: F32, side: int) -> F32:
-    """Means of squares of pixels; remaining rows and columns at the ends are dropped."""
-    rows, cols = (n // side for n in images.shape[1:])
-    whole = images[:, : rows * side, : cols * side]
-    return np.asarray(whole.reshape(len(images), rows, side, cols, side).mean(axis=(2, 4)), np.float32)

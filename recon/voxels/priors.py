@@ -74,10 +74,12 @@ class NoiseBalance:
         self.value = self.first
 
     @classmethod
-    def of(cls, problem: VoxelProblem, start: F32, sweeps: int) -> NoiseBalance:
-        """The weight for a problem that starts from the volume `start` [y, x, z], not zero.
+    def of(cls, problem: VoxelProblem, start: F32 | None, sweeps: int) -> NoiseBalance:
+        """The weight for a problem.
 
         Args:
+            start: [y, x, z], not zero, the volume that it follows from where no direct method makes one; None: without
+                one the weight is 0.
             sweeps: of the method.
         """
 
@@ -86,10 +88,11 @@ class NoiseBalance:
 
         noise = noise_of(problem.views)
         first = problem.filtered("hann")
-        volume = start if first is None else np.maximum(first, 0, out=first)
-        variation = total_variation(volume, difference_weights(problem.projector.grid))
-        matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
-        share = SHARE_OF_NOISE * noise**2 * matter / variation if variation > 0 else 0.0
+        volume, share = start if first is None else np.maximum(first, 0, out=first), 0.0
+        if volume is not None:
+            variation = total_variation(volume, difference_weights(problem.projector.grid))
+            matter = int(np.count_nonzero(volume > MATTER * density_unit(volume)))
+            share = SHARE_OF_NOISE * noise**2 * matter / variation if variation > 0 else 0.0
         left = noise if problem.measured is None else noise_of(problem.data)
         return cls(share, left * _by_views(problem.projector.geometry), sweeps)
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, some_values
-from recon.base.decisions import Decisions
+from recon.base.decisions import Decisions, Prior
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
+from recon.base.method import ReconProblem
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.kernels.cpu.tv import Weights
 from recon.kernels.cpu.vectors import replace_by_residual
@@ -111,6 +113,49 @@ def _inverse(sums: Any) -> Any:
     return 1 / sums
 
 
+class Units(NamedTuple):
+    """Powers of two near the lengths, line integrals and weights of the data: changing to these units is exact."""
+
+    length: int = 0
+    integral: int = 0
+    weight: int = 0
+
+    @classmethod
+    def of(cls, projector: Projector, data: F32, rays: F32 | None) -> Units:
+        largest = max(float(data.max()), -float(data.min()))
+        weight = 1.0 if rays is None else float(rays.max())
+        return cls(*(math.frexp(size)[1] for size in (projector.grid.voxel_size, largest, weight)))
+
+    @property
+    def density(self) -> int:
+        return self.integral - self.length
+
+    def projector(self, other: Projector, sign: int = -1) -> Projector:
+        """The projector in these units; with a sign of 1 back in those of the scan."""
+        box, power = other.grid, sign * self.length
+        edge, slices = (math.ldexp(n, power) for n in (box.voxel_size, box.spacing[0]))
+        z, y, x = (math.ldexp(n, power) for n in box.centre)
+        grid = Grid(box.shape, edge, (z, y, x), slices)
+        return replace(other, geometry=other.geometry.scaled(math.ldexp(1.0, power)), grid=grid)
+
+    def prior(self, prior: Prior, weighed: bool, sign: int = -1) -> Prior:
+        """The prior in these units, of rays that are `weighed` or not; with a sign of 1 back in those of the scan."""
+        weight = math.ldexp(prior.weight, sign * (self.length + self.integral + weighed * self.weight))
+        return prior._replace(weight=weight, strength=math.ldexp(prior.strength, sign * self.density))
+
+
+_NO_UNITS = Units()
+
+
+def times_power(array: F32, power: int) -> F32:
+    """array *= 2^power, in steps within float32's range."""
+    while power:
+        step = min(max(power, -100), 100)
+        array *= np.float32(2.0**step)
+        power -= step
+    return array
+
+
 POWER_ROUNDS, POWER_ROWS = 6, 16  # of power iteration, and what it sees where rows are alike
 
 
@@ -128,6 +173,7 @@ class VoxelProblem:
         trial_goes_on: called after each sweep of a trial on some rows; False ends this trial and the next ones.
         measured: the views as measured, where `data` are smoothed since voxels are too coarse for them; else None.
         with_all_columns: makes the problem with all columns, where these are some; steps are as long as of that one.
+        units: of all lengths, line integrals and weights here.
     """
 
     projector: Projector
@@ -140,6 +186,7 @@ class VoxelProblem:
     trial_goes_on: Callable[[], bool] = lambda: True
     measured: F32 | None = None
     with_all_columns: Callable[[], VoxelProblem] | None = None
+    units: Units = _NO_UNITS
     _norms: list[tuple[Projector, F32 | None, float]] = field(default_factory=list, repr=False)  # of copies, too
 
     @property
@@ -152,6 +199,20 @@ class VoxelProblem:
         norm = whole().norm if whole else largest_eigenvalue(self.projector, self.weight)
         self._norms.append((self.projector, self.weight, norm))
         return self._norms[-1][-1]
+
+    @property
+    def prior(self) -> Prior | None:
+        """The prior that was chosen before; None: the method decides."""
+        return None if self.decide.prior is None else self.units.prior(self.decide.prior, self.weight is not None)
+
+    @property
+    def of_scan(self) -> ReconProblem:
+        """The same views in the units of the scan, as methods get them."""
+        projector, rays = self.units.projector(self.projector, 1), self.weight
+        data = times_power(projection_images(self.views).copy(), self.units.integral)
+        weights = None if rays is None else times_power(projection_images(rays).copy(), self.units.weight)
+        views = Views(data, projector.geometry, weights)
+        return ReconProblem(views, projector.grid, device=projector.device)
 
     @property
     def views(self) -> F32:

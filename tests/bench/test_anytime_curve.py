@@ -20,7 +20,8 @@ import recon
 from beamline.plan.plan import fixed, golden, interlaced
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem
+from recon.base.method import ReconProblem
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting.finish import finish
 from recon.splatting.gaussians import Gaussians
@@ -101,9 +102,7 @@ def streamed(scan: Scan, renders: int) -> QualityCurve:
     model.finish(LAST / share)
     seconds, volume, gaussians = time.process_time() - begin, model.snapshot(), model.gaussians
     assert gaussians is not None
-    refined = finish(
-        volume, gaussians, ReconProblem(data, geometry, grid, DataUse(), 0, "cpu"), settings=model.settings
-    ).volume
+    refined = finish(volume, gaussians, ReconProblem(Views(data, geometry), grid), settings=model.settings).volume
     return QualityCurve(found, psnr(truth, volume.data), psnr(truth, refined.data), seconds)
 
 

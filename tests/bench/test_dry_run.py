@@ -100,8 +100,7 @@ def test_a_run_takes_the_seconds_that_were_expected(scan: str, method: Method) -
     for _ in range(repeats):
         made = recon.reconstruct(data, geometry, method)
     taken = (now() - begin) / repeats
-    made_by = str(made.settings.get("volume_by", made.method))
-    expected = found.choice_seconds + found.volumes.get(made_by, found.volumes.get(method.name, found.most))
+    expected = found.choice_seconds + found.volumes.get(made.method, found.most)
     SHARES.append(expected / taken)
     near = sum(abs(share - 1) <= _WITHIN for share in SHARES)
     print(

@@ -19,7 +19,8 @@ from scipy.ndimage import maximum_filter, minimum_filter
 import recon
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.base.method import ReconProblem, RunControl
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.error_bars import error_bars
 from recon.features.particles import cleaned, measured, parted, volume_deviation
@@ -79,7 +80,7 @@ def timed(work: Callable[..., Found], *arguments: object) -> tuple[float, Found]
 @pytest.mark.parametrize(("name", "views", "photons"), CHOSEN + CHECKED)
 def test_voxels_of_the_truth_within_one_deviation(shared_data: Path, name: str, views: int, photons: float) -> None:
     case = case_of(shared_data, name, views, photons)
-    problem = ReconProblem(case.projections, case.geometry, case.grid, DataUse(), 0, "cpu")
+    problem = ReconProblem(Views(case.projections, case.geometry), case.grid)
     parts = regions(case.truth)
     for label, method in METHODS.items():
         decide = Decisions(0)
@@ -128,7 +129,7 @@ def test_volumes_of_balls_within_their_intervals(seed: int, views: int, photons:
         for repeat in range(4):
             noisy = np.random.default_rng(10 * seed + repeat).poisson(counts)
             data = -np.log(np.maximum(noisy, 1) / photons).astype(np.float32)
-            problem = ReconProblem(data, geometry, Grid.matching(geometry), DataUse(), 0, "cpu")
+            problem = ReconProblem(Views(data, geometry), Grid.matching(geometry))
             decide = Decisions(0)
             volume = method.run(problem, RunControl(decide=decide)).volume
             bars = error_bars(method, problem, volume, decide.made, RunControl())

@@ -15,7 +15,8 @@ import pytest
 
 import recon
 from recon.assess.metrics import psnr
-from recon.base.method import DataUse, Progress, ReconProblem, RunControl
+from recon.base.method import Progress, ReconProblem, RunControl
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting.in_time import LastRound
 from recon.splatting.stream import StreamingFit
@@ -65,7 +66,7 @@ def _live(scan: Scan, steps: float) -> LiveCurve:
             begin += two_cores() - now
 
     last = LastRound(fit, recon.R2(), 1e9, 0.0, on_progress=look)
-    made = last.run(ReconProblem(data, geometry, grid, DataUse(), 0, "cpu"), RunControl())
+    made = last.run(ReconProblem(Views(data, geometry), grid), RunControl())
     found.seconds.append(two_cores() - begin)
     found.after.append(psnr(truth, made.volume.data))
     return found

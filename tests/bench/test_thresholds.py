@@ -138,7 +138,7 @@ def _without(name: str, value: Any) -> Iterator[None]:
 def _quality(case: Case, method: recon.Method, by_noise: bool) -> float:
     with ExitStack() as stack:
         if by_noise:
-            held_out = "recon.voxels.held_out.HeldOutTrial.of"
+            held_out = "recon.voxels.trial.Trial.of"
             stack.enter_context(patch(held_out, classmethod(lambda cls, problem: None)))
             method = recon.FistaTv()
         use = recon.DataUse(case.weights)

@@ -9,9 +9,10 @@ import pytest
 
 import recon
 from recon import methods
-from recon.auto import Auto, part_of
+from recon.auto import Auto
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, ReconProblem
+from recon.base.view_data import Views
+from recon.voxels.field_edges import busiest_rows, slab_of
 from recon.voxels.odd_views import odd_views
 from recon.voxels.projector import Projector, seen_rays
 from tests.recon.helpers import data_residual
@@ -85,11 +86,10 @@ def test_auto_tries_leaning_views_on_rows_and_all_slices_that_they_see() -> None
     tall = recon.Grid((84, 32, 32), 0.04)
     axes = AXES * (1, 1, 6)  # matter above and below the rows
     data = ellipsoid_shadow(geometry, axes, CENTRE).astype(np.float32)
-    problem = ReconProblem(data, geometry, tall, DataUse(), 0, "cpu")
-    part, where = part_of(problem, 24)
-    assert part is not None and where.startswith("rows") and part.projections.shape[1] == 24
-    truth = recon.Volume(smooth_ball(part.grid, axes, CENTRE), part.grid)
-    assert part.grid.shape[0] < tall.shape[0] / 2 and data_residual(truth, part.projections, part.geometry) < 0.05
+    rows = busiest_rows(data, 24)
+    part, box = slab_of(geometry, tall, rows.start, rows.stop)
+    truth = recon.Volume(smooth_ball(box, axes, CENTRE), box)
+    assert box.shape[0] < tall.shape[0] / 2 and data_residual(truth, data[:, rows], part) < 0.05
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1.5])
@@ -118,6 +118,6 @@ def test_a_view_that_differs_is_found_among_leaning_ones(cone: bool, rng: np.ran
     geometry = leaning(cone)
     data = rays(geometry) + rng.normal(0, 0.003, (32, 32, 38)).astype(np.float32)
     truth = recon.Volume(smooth_ball(GRID, AXES, CENTRE), GRID)
-    assert odd_views(truth, data, geometry, None) == ()
+    assert odd_views(truth, Views(data, geometry)) == ()
     data[11, 10:20, 14:24] += 0.1
-    assert [odd.view for odd in odd_views(truth, data, geometry, None)] == [11]
+    assert [odd.view for odd in odd_views(truth, Views(data, geometry))] == [11]

@@ -123,7 +123,7 @@ def _print_statistics(scan: SourceOptions, output: Path | None, light: LightAske
 
 
 def _print_measured(file: Path, truth: str | None, masks: Path | None, as_json: bool) -> None:
-    from beamline.reconstruct.measure import measured_file
+    from beamline.reconstruct.truth import measured_file
     from beamline.report.metrics import METRICS, formatted
 
     with answering(as_json) as answer:

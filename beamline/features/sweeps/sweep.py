@@ -18,7 +18,6 @@ from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections, hold_out
 from beamline.projections.selection import Selection, cone_of, rows_of
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
-from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.figures import WIDTH, new_figure, png, show_image
 from drivers.base.clock import Clock
@@ -27,8 +26,9 @@ from recon.base.empirical import ONE_IN
 from recon.base.greys import matter_window
 from recon.base.method import Reconstruction, RunControl
 from recon.base.volume import Grid
-from recon.voxels.held_out import beyond_chance
+from recon.voxels.choice import predicts_as_well
 from recon.voxels.projector import Projector
+from recon.voxels.residuals import squares_left
 from recon.voxels.resolution import ViewResolution
 
 _FLAT = 0.05  # share by which the residual of a direct method must change: one of 0.03 named an axis 0.7 columns off
@@ -83,7 +83,7 @@ class Scores:
 
     @property
     def shares(self) -> F64:
-        """[slice] data residual of the held-out views, as in `beamline.reconstruct.measure`."""
+        """[slice] data residual of the held-out views, as in `recon.judgement`."""
         return np.asarray(np.sqrt(np.square(self.residuals).mean(axis=1)))
 
     @property
@@ -97,8 +97,7 @@ class Scores:
         """Verdict [slice]: "best"; "alike", not significantly different from the best; or empty."""
         if self.best is None:
             return [""] * len(self.residuals)
-        more = self.residuals - self.residuals[self.best]
-        words = ["" if beyond_chance(each, 1.0) else "alike" for each in more]
+        words = ["alike" if predicts_as_well(each, self.residuals[self.best]) else "" for each in self.residuals]
         return [*words[: self.best], "best", *words[self.best + 1 :]]
 
 
@@ -217,7 +216,8 @@ def scores_of(slices: Sequence[SweptSlice], *, direct: bool = False) -> Scores |
             return None
         alike &= np.array_equal(measured, first, equal_nan=True)
         for n, each in enumerate(slices):
-            left, own = squares_left(each.projected[np.searchsorted(each.ids, common)], measured, resolution)
+            model = each.projected[np.searchsorted(each.ids, common)].swapaxes(1, 2)
+            left, own, _ = squares_left(model, measured.swapaxes(1, 2), None, resolution)
             residuals[n] += np.sqrt(left)
         scale += float(np.sqrt(own.mean()))
     if scale == 0:

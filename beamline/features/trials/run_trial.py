@@ -17,7 +17,6 @@ from beamline.core.machine import peak_memory, reset_peak_memory
 from beamline.features.trials.trial import Outcome, Trial
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.measure import squares_left
 from beamline.reconstruct.run import run_on
 from recon.assess import metrics
 from recon.base.arrays import F32
@@ -25,9 +24,10 @@ from recon.base.geometry import Geometry
 from recon.base.method import RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
-from recon.voxels.projector import project
-from recon.voxels.resolution import ViewResolution
+from recon.judgement import judge
 from recon.warm_up import warm_up
+
+_JUDGED = "psnr", "ssim3d", "residual_held_out"
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,25 +118,12 @@ def _views_of(trial: Trial, data: TrialData) -> PreparedProjections:
 
 def measured(method: str, volume: F32, data: TrialData, grid: Grid) -> tuple[dict[str, float], list[float]]:
     """Figures of the volume [z, y, x], and the squared residual of each view held out."""
-    figures, squared = dict[str, float](), list[float]()
-    if data.truth is not None:
-        figures = {"psnr": metrics.psnr(data.truth, volume), "ssim3d": metrics.ssim3d(data.truth, volume)}
+    made, truth = Volume(volume, grid), None if data.truth is None else Volume(data.truth, grid)
+    judged = judge(made, data.prepared.views, truth, held_out=data.prepared.views_held_out)
+    figures = {name: value for name, value in judged.figures.items() if name in _JUDGED}
     if (reference := data.references.get(method)) is not None:
         figures["psnr_all"] = metrics.psnr(reference, volume)
         figures["ssim_all"] = metrics.ssim3d(reference, volume)
     if data.regions is not None:
         figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(volume), data.regions)
-    if data.prepared.held_out is not None:
-        unseen, geometry = data.prepared.held_out
-        rays = data.prepared.ray_weights(geometry.n_views)
-        left, own = squares_left(
-            project(Volume(volume, grid), geometry),
-            unseen,
-            ViewResolution.of(geometry, grid),
-            None if rays is None else np.asarray(rays[data.geometry.n_views :] > 0),
-        )
-        if not own.any():
-            raise ValueError("all held-out views are zero, so no residual can be computed")
-        figures["residual_held_out"] = math.sqrt(left.sum() / own.sum())
-        squared = left.tolist()
-    return figures, squared
+    return figures, [] if judged.held_out is None else judged.held_out.left.tolist()

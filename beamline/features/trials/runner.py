@@ -21,8 +21,8 @@ from beamline.features.trials.trial import HELD_OUT, Outcome, Trial, TrialTable
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
-from beamline.reconstruct.measure import fit_truth, read_truth
 from beamline.reconstruct.scan_facts import facts_of
+from beamline.reconstruct.truth import fit_truth, read_truth
 from beamline.report.sheets import SliceSheet
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import Clock

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon import Geometry, Grid, Progress, Reconstruction, RunControl, Volume
-from recon.base.masks import masked
 from recon.base.method import ReconProblem, Traits
 from recon.splatting.initialise import first_volume
 from recon.voxels.voxel_problem import density_unit
@@ -135,7 +134,8 @@ def fit_field(method: FieldMethod, problem: ReconProblem, control: RunControl) -
     if geometry.width:
         warnings.warn(f"a neural field supports only rays without a width, got {geometry.width}", stacklevel=2)
     used = np.setdiff1d(np.arange(geometry.n_views), np.asarray(problem.use.held_out, int))
-    data, weights = masked(problem.projections, problem.use.weights)
+    given = problem.views.masked()
+    data, weights = given.data, given.weights
     grid = Grid.for_fit(geometry, problem.grid, wider=problem.wide)
     unit = density_unit(first_volume(data[used], geometry.select(used), grid).data)
     if unit <= 0 or not (data[used] > 0).any():

@@ -19,9 +19,10 @@ from recon.base.arrays import F32, F64, Mask
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.noise import AT_AXIS, NARROWEST, ring_offsets, steadiness
+from recon.base.view_data import split_views
 from recon.base.volume import Grid, Volume
+from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.field_edges import busiest_rows
-from recon.voxels.held_out import beyond_chance, split_views
 from recon.voxels.iterative import solve
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
@@ -34,7 +35,7 @@ _BAND, _HALO = 16, 4  # rows at a time; rows beside them that tell a stripe of a
 _ONE_IN = 6  # views held out
 _TV_WEIGHT = 1e-3  # three times as much takes a sixth of a ball on the axis
 _FIRST, _SWEEPS, _ROUNDS = 8, 4, 4
-_BETTER, _SURE = 0.99, 3.0  # share of the mean square of views held out to be reached; see `beyond_chance`
+_BETTER, _SURE = 0.99, 3.0  # share of the mean square of views held out to be reached; see `exceeds_standard_error`
 _LOOKED_AT = 8  # rows
 _BUFFERS = Buffers(8.5, 7.0, 5.0)
 
@@ -98,7 +99,7 @@ def learn_gains(
             plain, _ = band.learn(seen, gains=False)
             none = np.zeros_like(pixels)
             without, left = band.errors(plain, none, unseen, own), band.errors(volume, pixels, unseen, own)
-            if not (beyond_chance(without - left, _SURE) and left.mean() < _BETTER * without.mean()):
+            if not (exceeds_standard_error(without - left, _SURE) and left.mean() < _BETTER * without.mean()):
                 return LearntGains(np.zeros_like(gains), _root(without), _root(left), False)
     return LearntGains(gains, _root(without), _root(left), True)
 

@@ -19,7 +19,8 @@ from recon.base.arrays import F32, F64, bin_views
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.features.calibration.joint import TERMS, GeometryChange, JointFit, edge_motion, taller
-from recon.voxels.held_out import beyond_chance, predicted_views
+from recon.voxels.choice import exceeds_standard_error
+from recon.voxels.held_out import predicted_views
 from recon.voxels.methods import FistaTv
 
 _ONE_IN = 4  # views held out
@@ -27,7 +28,7 @@ _SWEEPS, _TV_WEIGHT = 6, 3e-3
 _EDGE = 1  # row at either end, in which rays of leaning views leave the slices seen
 _SMOOTH = 4.0  # pixels
 _LEAST = 0.002  # share of the squared deviation that a better geometry takes away
-_SURE = 2.0  # see `beyond_chance`
+_SURE = 2.0  # see `exceeds_standard_error`
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,7 @@ def better(one: F64, other: F64) -> bool:
     """Whether the first deviations [view] are significantly less than the second, given the scatter from view to
     view."""
     share: NDArray[np.float64] = 1 - np.square(one) / np.maximum(np.square(other), 1e-30)
-    return bool(share.mean() > _LEAST) and beyond_chance(share, _SURE)
+    return bool(share.mean() > _LEAST) and exceeds_standard_error(share, _SURE)
 
 
 COLS, ROWS = 320, 96  # Pixels that show the geometry; more cost time

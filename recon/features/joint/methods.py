@@ -122,7 +122,7 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
     Raises:
         ValueError: no line integral that was measured is above 0.
     """
-    data, weights = problem.projections, problem.use.weights
+    data, weights = problem.views.data, problem.views.weights
     if not (finite := np.isfinite(data)).all():
         weights = finite.astype(np.float32) if weights is None else weights * finite
     if weights is not None:

@@ -29,12 +29,12 @@ from recon.features.joint.learnt_motion import (
 from recon.features.joint.motion import Motion, moved
 from recon.features.joint.proportions import SOLUTION_STEPS, TRIAL_STEPS, Countdown, Proportions, smoothness
 from recon.features.joint.spectral import weight_of, weights_by_views
-from recon.voxels.held_out import beyond_chance
+from recon.voxels.choice import exceeds_standard_error
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
 
 MOMENTS = 64  # from one knot to the next, at most: views of a moment count as simultaneous
 _MOTION_MOMENTS = 16  # of the scan, to learn the motion, which is smooth in time
-_SURE = 2.0  # standard errors over eight blocks of views held out, see `beyond_chance`: 4 % of false alarms
+_SURE = 2.0  # standard errors over eight blocks of views held out, see `exceeds_standard_error`: 4 % of false alarms
 _LESS = 0.95  # of the squares that volumes leave of views held out: a motion or factors that leave less are there
 _ROWS = 16  # of the trial of factors
 _TRIALS = 24 * 13  # sweeps of weights on these rows: 24 * 11 for usual data, 24 * 16 at most
@@ -203,7 +203,7 @@ def _motion(
 
 def _moves(still: F64, moved: F64) -> bool:
     """Whether matter moves, by squared residuals [block] of views held out without and with motion."""
-    return beyond_chance(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
+    return exceeds_standard_error(still - moved, _SURE) and float(moved.mean()) < _LESS * float(still.mean())
 
 
 def _as_factors(made: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callable[[int, float], bool]) -> TimedVolumes:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beamline.page.volume import ShownVolume
-from beamline.reconstruct.measure import read_truth
+from beamline.reconstruct.truth import read_truth
 from beamline.simulate import volumes_beside
 from beamline.storage.volumes.files import opened_volume
 from tests.beamline.cli.small_scan import beamline

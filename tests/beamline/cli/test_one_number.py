@@ -10,10 +10,10 @@ import pytest
 
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.measure import measure
 from beamline.report.metrics import METRICS
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
+from recon.judgement import judge
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution
@@ -34,7 +34,7 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     prepared = replace(prepared, view_weights=None)
     grid = Grid.matching(prepared.geometry)
     volume = Volume(direct(prepared.projections.data, prepared.geometry, grid, "hann"), grid)
-    by_recon = measure(volume, prepared, None)["residual_held_out"]
+    by_recon = judge(volume, prepared.views, held_out=prepared.views_held_out).figures["residual_held_out"]
     assert prepared.held_out is not None and prepared.held_out_ids is not None
     projector = Projector(prepared.held_out[1], grid)
     one = sweep.SweptSlice(

@@ -10,7 +10,6 @@ import pytest
 
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.reconstruct.measure import measure, residuals_along_rows
 from beamline.reconstruct.options import OutputPaths
 from beamline.reconstruct.scan_facts import ReportContext, ScanFacts
 from beamline.reconstruct.volume_checks import check_volume, not_begun_warning
@@ -18,6 +17,7 @@ from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.method import Ending, Reconstruction
 from recon.base.volume import Grid, Volume
+from recon.judgement import Aspect, judge
 from recon.splatting.gaussians import Gaussians
 from recon.voxels.projector import project
 from tests.beamline.prepared_views import prepared_views
@@ -45,7 +45,7 @@ def warnings_of(made: Reconstruction, prepared: PreparedProjections, selection: 
     """Those of a volume without a report."""
     facts = ScanFacts(Path("scan.h5"), "scan.h5", "", {}, "")
     context, target = ReportContext(facts, selection, "", 0), OutputPaths(Path("out.h5"), None)
-    return check_volume(made, prepared, None, target, context, lambda event: None, SystemClock()).warnings
+    return list(check_volume(made, prepared, None, target, context, lambda event: None, SystemClock()).warnings)
 
 
 def odd(said: list[str]) -> str:
@@ -113,9 +113,9 @@ def test_a_volume_of_one_density_is_said_to_show_nothing(
         prepared = replace(prepared, projections=replace(prepared.projections, data=data))
     blank = np.float32(0.7 * truth.mean())
     volume = replace(made.volume, data=amount * truth + (1 - amount) * blank)
-    left, uniform = residuals_along_rows(volume, prepared)
-    assert (measure(volume, prepared, None)["residual"] > 0.5) is (wider or not begun)
-    said = not_begun_warning(replace(made, volume=volume), left, uniform)
+    judgement = judge(volume, prepared.views, aspects=Aspect.RESIDUAL | Aspect.FIT)
+    assert (judgement.figures["residual"] > 0.5) is (wider or not begun)
+    said = not_begun_warning(replace(made, volume=volume), judgement)
     assert (said == "") is begun
     assert begun or ("shows nothing of the sample" in said and "more seconds, steps or iterations" in said)
 
@@ -135,7 +135,9 @@ def test_the_differences_that_a_uniform_cylinder_leaves_in_closed_form() -> None
     left = {}
     for name, data in {"one": shadow, "two": factors * shadow, "within others": factors * (shadow + 30)}.items():
         views = replace(prepared, projections=replace(prepared.projections, data=data))
-        left[name] = residuals_along_rows(full, views)
+        found = judge(full, views.views, aspects=Aspect.RESIDUAL | Aspect.FIT).along_rows
+        assert found is not None
+        left[name] = found
     assert left["one"][1] <= left["one"][0] < left["one"][1] + 0.001 and left["one"][0] < 0.02
     assert left["two"][1] == pytest.approx(scatter, abs=0.01)
     assert left["within others"] == pytest.approx(left["two"], abs=1e-4)

@@ -12,7 +12,7 @@ from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
-from recon.splatting.checkpoint import arrays_of, decisions_from, decisions_of, state_from
+from recon.splatting.checkpoint import arrays_of, state_from
 from recon.splatting.problem import FitProblem
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.splat import project
@@ -68,12 +68,3 @@ def test_what_is_no_checkpoint_is_refused(random_gaussians: Make) -> None:
     other = fit.init(random_gaussians(5), np.random.Generator(np.random.MT19937(0)))
     with pytest.raises(ValueError, match="MT19937"):
         arrays_of(other)
-
-
-def test_decisions_on_the_prior_are_kept() -> None:
-    made: dict[str, list[Any]] = {"candidate": [1], "units": [(3, -2, 0), (4, 4, 4)], "weight": [[0.25]], "other": [7]}
-    kept = decisions_from(decisions_of(made, ("candidate", "units", "weight", "strength")))
-    assert kept == {"candidate": [1], "units": [[3, -2, 0]], "weight": [[0.25]]}
-    assert all(isinstance(n, int) for n in kept["units"][0])  # powers of two
-    with pytest.raises(ValueError, match="the checkpoint is"):
-        decisions_from({"decided.weight": np.array([np.nan])})

@@ -5,27 +5,26 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from recon.assess.metrics import psnr
-from recon.base.decisions import Decisions
+from recon.auto import Auto
 from recon.base.geometry import Geometry
-from recon.base.method import SWEEPS_OF_TRIALS, DataUse, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, RunControl
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.methods import build
 from recon.reconstruction import reconstruct
-from recon.splatting.finish import Candidates, finish, judged
+from recon.splatting.finish import finish
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
-from recon.voxels.methods import FistaTv, PnpDct
+from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
@@ -48,7 +47,7 @@ def _of(g: Gaussians, grid: Grid = GRID) -> Volume:
 
 
 def _problem(data: F32, weights: F32 | None = None, grid: Grid = GRID) -> ReconProblem:
-    return ReconProblem(data, VIEWS, grid, DataUse(weights), 0, "cpu")
+    return ReconProblem(Views(data, VIEWS, weights), grid)
 
 
 def test_a_model_that_explains_all_is_only_smoothed() -> None:
@@ -140,7 +139,7 @@ def test_matter_that_fills_its_box_is_left_to_the_voxels(rng: np.random.Generato
     grid = Grid.matching(views)
     truth = (0.02 * (1 + rng.integers(0, 3, (3, 8, 8)))).astype(np.float32).repeat(4, 0).repeat(4, 1).repeat(4, 2)
     data = Projector(views, grid).forward(truth) + rng.normal(0, 0.01, (40, 12, 32)).astype(np.float32)
-    fitted, found = (reconstruct(data, views, fit).volume.data for fit in (R2(finish=0), R2()))
+    fitted, found = (reconstruct(data, views, method).volume.data for method in (R2(finish=0), Auto()))
     assert psnr(truth, found) > psnr(truth, fitted) + 3
 
 
@@ -153,7 +152,7 @@ def test_matter_above_and_below_a_cone_stays_out_of_the_end_slices() -> None:
     data = Projector(views, tall).forward(body.astype(np.float32))
     data += np.random.default_rng(0).normal(0, 0.003, data.shape).astype(np.float32)
     fitted, found = (reconstruct(data, views, R2(finish=n), grid=grid).volume.data for n in (0, None))
-    raw = FistaTv().run(ReconProblem(data, views, grid, DataUse(), 0, "cpu"), RunControl()).volume.data  # its own box
+    raw = FistaTv().run(ReconProblem(Views(data, views), grid), RunControl()).volume.data  # its own box
     truth = body[12:23]
     assert psnr(truth[2:9], found[2:9]) > psnr(truth[2:9], fitted[2:9]) + 1  # the end slices have few rays to refine
     assert min(psnr(truth, found), psnr(truth, fitted)) > psnr(truth, raw) + 10
@@ -186,65 +185,6 @@ def test_what_cannot_be_is_refused() -> None:
         reconstruct(data, VIEWS, R2(steps=1, finish=-1))
     with pytest.raises(ValueError, match=r"'finish' \(r2, r2-published"):
         build(Fbp, {"finish": 2})
-
-
-def _won_by(at: int, prior: dict[str, list[Any]]) -> Candidates:
-    smooth, patches, fit = (np.full(3, float(n != at)) for n in range(3))
-    return Candidates(None, smooth, patches, fit, prior)
-
-
-@pytest.mark.parametrize("at", [0, 1, 2])
-def test_the_volume_is_that_of_the_best_candidate(at: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On voxels with the prior of the trial, after a short fit that gives the model."""
-    data = Projector(VIEWS, GRID).forward(_box())
-    prior = {"weight": [[1e-3]], "strength": [[1e-3, 1.0]]}
-    monkeypatch.setattr("recon.splatting.train.judged", lambda *_: _won_by(at, prior))
-    found = R2(gaussians=50).run(_problem(data), RunControl())
-    assert found.settings["volume_by"] == ("fista-tv", "pnp-dct", "r2")[at]
-    assert found.settings["steps"] == (50, 50, 400)[at] and found.gaussians is not None
-    if at < 2:
-        decide = Decisions(0, prior)
-        alone = (FistaTv(), PnpDct())[at].run(_problem(data), RunControl(decide=decide)).volume.data
-        np.testing.assert_array_equal(found.volume.data, alone)
-
-
-def test_another_slab_makes_no_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    data, first = Projector(VIEWS, GRID).forward(_box()), Decisions()
-    monkeypatch.setattr("recon.splatting.train.judged", lambda *_: _won_by(0, {"weight": [[1e-3]]}))
-    one = R2(gaussians=50).run(_problem(data), RunControl(decide=first)).volume.data
-    monkeypatch.setattr("recon.splatting.train.judged", Mock(side_effect=AssertionError))
-    other = R2(gaussians=50).run(_problem(data), RunControl(decide=Decisions(0, first.made))).volume.data
-    np.testing.assert_array_equal(one, other)
-
-
-def test_gaussians_are_not_fitted_to_what_voxels_predict_as_well(rng: np.random.Generator) -> None:
-    """A chequered box, sharp to the voxel; the fit of a trial is a hundred times as dense, which no sweeps mend."""
-    data = Projector(VIEWS, GRID).forward(_box()) + rng.normal(0, 0.02, (30, 8, 40)).astype(np.float32)
-
-    def poor(part: ReconProblem, *_: object) -> Reconstruction:
-        fitted = R2(steps=5, gaussians=50, finish=0).run(part, RunControl())
-        fitted.volume.data[...] *= 100
-        return fitted
-
-    fit = Mock(side_effect=poor)
-    tried = judged(_problem(data), R2().fit, RunControl(), fit)
-    assert tried.by_voxels is not None and tried.fit is not None and tried.fit.mean() > tried.by_voxels.mean()
-    assert set(tried.prior) == {"units", "weight", "strength"}
-    assert fit.call_args[0][0].geometry.n_views == 26  # views held out are not fitted
-    assert fit.call_count == 1 and fit.call_args[0][2] == 0.25  # voxels lead: the other steps are not tried
-    fit.reset_mock()
-    assert judged(_problem(data), R2().fit, RunControl(), fit, least_gain=0.0).full_trial_seconds == 0
-    assert fit.call_count == 2 and fit.call_args[0][2] == 1.0
-    fit.reset_mock()
-    none = judged(replace(_problem(data[:12]), geometry=VIEWS.select(range(12))), R2().fit, RunControl(), fit)
-    assert none.by_voxels is None and none.fit is None and fit.call_count == 0
-
-
-def test_a_stop_ends_the_trials() -> None:
-    data, looks = Projector(VIEWS, GRID).forward(_box()), iter([False, False])
-    stop = RunControl(lambda: next(looks, True))
-    tried = judged(_problem(data), R2().fit, stop, Mock())
-    assert tried.by_voxels is None and not tried.prior
 
 
 @pytest.mark.parametrize(("voxels", "seconds"), [(24, None), (12, 1e9)])

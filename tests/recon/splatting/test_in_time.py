@@ -10,7 +10,8 @@ import pytest
 import recon
 from recon import R2, Geometry, Grid, RunControl
 from recon.base.decisions import Decisions
-from recon.base.method import DataUse, ReconProblem
+from recon.base.method import ReconProblem
+from recon.base.view_data import Views
 from recon.splatting.in_time import FinishPlan, finish_within, planned_finish
 from recon.voxels.projector import Projector
 from tests.clock import SteppedClock
@@ -45,7 +46,7 @@ def test_a_finish_gets_as_many_sweeps_as_its_time_suffices_for() -> None:
 
 def test_sweeps_that_are_given_keep_their_whole_share_of_the_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 40))
-    problem = ReconProblem(np.zeros((24, 6, 40), np.float32), views, Grid.matching(views), DataUse(), 0, "cpu")
+    problem = ReconProblem(Views(np.zeros((24, 6, 40), np.float32), views), Grid.matching(views))
     for found, given, planned in ((3, 20, (20, 80.0)), (0, 20, (0, 0.2)), (3, None, (3, 0.2))):
         monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, found=found: FinishPlan(found, 0.2))
         plan = planned_finish(R2(finish=given), 100.0, 10.0, problem, SteppedClock(tick=1.0))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Truncation
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting.backend import Cpu
 from recon.splatting.gaussians import Gaussians
@@ -96,7 +97,8 @@ def test_masked_pixels_have_no_part_in_joined_ones(seed: int, share: float, fact
     weights = rng.uniform(0.1, 2, data.shape).astype(np.float32)
     weights[rng.random(data.shape) < share] = 0
     weights[:, 0, 0] = 1  # no view is blind
-    found, kept, views = join_pixels(data, weights, VIEWS, factor)
+    joined = join_pixels(Views(data, VIEWS, weights), factor)
+    found, kept, views = joined.data, joined.weights, joined.geometry
     rows, cols = 12 // factor, 18 // factor
     assert kept is not None and found.shape == kept.shape == (3, rows, cols) == (3, *views.detector_shape)
     for view, row, col in np.ndindex(3, rows, cols):
@@ -120,7 +122,8 @@ def test_the_sample_stays_in_place_behind_binned_pixels(beam: str, factor: int) 
     means = np.array([[1.0, -2.0, 3.0], [-2.0, 1.0, -4.0], [3.0, 2.0, 1.0]])
     model = Gaussians.from_physical(means, np.full((3, 3), 0.5 * width), np.full(3, 0.2))
     fine = project(model, views, truncation=cut).numpy()
-    binned, _, rough = join_pixels(fine, None, views, factor)
+    joined = join_pixels(Views(fine, views), factor)
+    binned, rough = joined.data, joined.geometry
     off = np.abs(project(model, rough, truncation=cut).numpy() - binned).max() / fine.max()
     # A mean over a pixel differs from the value in its middle by factor² / 24 times the second derivatives, of which
     # there are two, each at most 1 / width². Half a pixel off would be 0.6 * 0.5 / width, for factor 2 five times that.
@@ -130,7 +133,7 @@ def test_the_sample_stays_in_place_behind_binned_pixels(beam: str, factor: int) 
 def test_a_detector_too_small_to_be_binned_is_told_by_name() -> None:
     one = Geometry.parallel(VIEWS.angles, (1, 18), pixel_pitch=0.5)
     with pytest.raises(ValueError, match=r"joined_pixels=2 joins 2 x 2.* 1 or less"):
-        join_pixels(np.ones((3, 1, 18), np.float32), None, one, 2)
+        join_pixels(Views(np.ones((3, 1, 18), np.float32), one), 2)
 
 
 def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(rng: np.random.Generator) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, Truncation
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.problem import join_pixels
@@ -55,7 +56,8 @@ def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generato
     settings, count = FitSettings(), flat.size // 24
     problem = fit.problem_of(data.astype(np.float32), views, grid, 0.7, settings)
     assert tv_weight(settings, problem, count) == pytest.approx(weight, rel=0.1)
-    binned, _, joined_views = join_pixels(data.astype(np.float32), None, views, 2)
+    joined = join_pixels(Views(data.astype(np.float32), views), 2)
+    binned, joined_views = joined.data, joined.geometry
     rough = fit.problem_of(binned, joined_views, grid, 0.7, settings)
     assert tv_weight(settings, rough, count) == pytest.approx(weight, rel=0.1)
     assert tv_weight(FitSettings(tv_weight=0.0), problem, count) == 0

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from recon import Geometry, Grid
 from recon.assess.metrics import psnr
-from recon.base.method import DataUse, ReconProblem, RunControl
+from recon.base.method import ReconProblem, RunControl
+from recon.base.view_data import Views
 from recon.splatting.anytime import PredictionErrors, direct_volume, volume_error
 from recon.splatting.in_time import LastRound
 from recon.splatting.r2 import R2
@@ -96,7 +97,7 @@ def test_the_end_is_the_same_however_long_the_fit_had_to_wait(data: np.ndarray) 
     def quality(steps: float) -> float:
         fit = _grown(data, steps)
         last = LastRound(fit, R2(), 1e9, 0.0)
-        made = last.run(ReconProblem(data, VIEWS, GRID, DataUse(), 0, "cpu"), RunControl(now=SteppedClock(tick=1e-3)))
+        made = last.run(ReconProblem(Views(data, VIEWS), GRID), RunControl(now=SteppedClock(tick=1e-3)))
         assert made.history[-1].step == made.history[-1].steps
         return psnr(TRUTH, made.volume.data)
 

@@ -7,6 +7,7 @@ import pytest
 
 import recon
 from recon.base.method import DataUse, ReconProblem, RunControl, SampleRadius
+from recon.base.view_data import Views
 from recon.voxels.beyond_field import offset_error, sample_radius
 from recon.voxels.field_edges import taller_than_field
 from recon.voxels.projector import Projector
@@ -60,7 +61,7 @@ def made(wide: tuple[np.ndarray, np.ndarray]) -> recon.Reconstruction:
 
 def test_a_sample_within_the_field_gets_the_volume_of_the_method_to_the_bit() -> None:
     views = views_of(can(0.8 * COLS / 2))
-    problem = ReconProblem(views, GEOMETRY, recon.Grid.matching(GEOMETRY), DataUse(), 0, "cpu")
+    problem = ReconProblem(Views(views, GEOMETRY), recon.Grid.matching(GEOMETRY))
     made = recon.reconstruct(views, GEOMETRY, METHOD)
     assert np.array_equal(made.volume.data, METHOD.run(problem, RunControl()).volume.data)
     assert made.outside is None and "sample_radius" not in made.settings
@@ -81,7 +82,7 @@ def test_the_fields_part_is_right_where_a_box_of_the_field_is_far_off(
     wide: tuple[np.ndarray, np.ndarray], made: recon.Reconstruction
 ) -> None:
     views, truth = wide
-    alone = METHOD.run(ReconProblem(views, GEOMETRY, recon.Grid.matching(GEOMETRY), DataUse(), 0, "cpu"), RunControl())
+    alone = METHOD.run(ReconProblem(Views(views, GEOMETRY), recon.Grid.matching(GEOMETRY)), RunControl())
     by_fbp = recon.reconstruct(views, GEOMETRY, "fbp").volume.data
     assert made.volume.grid == recon.Grid.matching(GEOMETRY)
     assert error(made.volume.data, truth) < 0.9 * error(by_fbp, truth)
@@ -183,7 +184,7 @@ def test_matter_above_and_below_the_field_of_a_cone_stays_out_of_its_slices() ->
     rod = np.where(np.hypot(x, y) < 14, 0.01 + 0.01 * (np.sin(z) > 0), 0).astype(np.float32)
     inner = slice(16, 32)
     views = Projector(cone, tall).forward(rod)
-    problem = ReconProblem(views, cone, grid, DataUse(), 0, "cpu")
+    problem = ReconProblem(Views(views, cone), grid)
     made, alone = recon.reconstruct(views, cone, METHOD), METHOD.run(problem, RunControl())
     assert made.volume.grid == grid and made.outside is not None
 

@@ -8,10 +8,6 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 import recon
@@ -19,25 +15,18 @@ from recon import FistaTv, OsSirtTv
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.noise import noise_level
+from recon.base.view_data import split_views
 from recon.base.volume import Grid
 from recon.kernels.cpu.activation import F32
-from recon.voxels import held_out
+from recon.voxels.choice import BestStrength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, slab_of
-from recon.voxels.held_out import (
-    LEAST_VIEWS,
-    BestStrength,
-    HeldOutTrial,
-    beyond_chance,
-    cheapest_not_led,
-    choose_weight,
-    preferred_strength,
-    split_views,
-    unseen_residuals,
-)
+from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.iterative import solve
 from recon.voxels.priors import pnp_dct
 from recon.voxels.projector import Projector
+from recon.voxels.residuals import unseen_residuals
 from recon.voxels.resolution import ViewResolution
+from recon.voxels.trial import Trial, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
 
 VIEWS, ROWS, COLS, PHOTONS = 40, 16, 64, 1000
@@ -66,7 +55,7 @@ def test_a_texture_survives(
     data, geometry, grid, truth = foam
     peak = float(truth.max())
     found = recon.reconstruct(data, geometry, method, grid=grid).volume.data
-    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: None)
     by_noise = recon.reconstruct(data, geometry, method, grid=grid).volume.data
     monkeypatch.setattr("recon.voxels.priors.noise_beside_structure", lambda lines, _: noise_level(lines))
     by_texture = recon.reconstruct(data, geometry, method, grid=grid).volume.data  # the texture counts as noise
@@ -83,7 +72,7 @@ def test_an_even_disc_gets_little_more_noise_than_by_the_weight_by_the_noise(
     data = Projector(geometry, Grid.matching(geometry)).forward(truth)
     data += rng.normal(0, 1, data.shape).astype(np.float32)
     found = recon.reconstruct(data, geometry, FistaTv()).volume.data
-    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: None)
     by_noise = recon.reconstruct(data, geometry, FistaTv()).volume.data
     assert psnr(truth, found) > psnr(truth, by_noise) - 1
 
@@ -122,82 +111,16 @@ def test_a_crack_under_few_photons_stays_nearly_as_deep_as_in_fbp(
     cracked: tuple[F32, Geometry], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = _depth(recon.reconstruct(*cracked, FistaTv()).volume.data)
-    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: None)
     by_noise = _depth(recon.reconstruct(*cracked, FistaTv()).volume.data)
     fbp = _depth(recon.reconstruct(*cracked, "fbp").volume.data)
     assert by_noise < 0.8 * fbp
     assert found > 0.9 * fbp
 
 
-SCATTER = np.array([-0.3, 0.1, 0.4, -0.2, 0.0])  # of views, which all candidates share
-
-
-@given(arrays(np.float64, 6, elements=st.floats(-1.0, 1.0)), st.floats(0.1, 10.0))
-def test_beyond_chance_is_more_than_a_standard_error_in_any_unit(gains: NDArray[np.float64], unit: float) -> None:
-    error = float(gains.std(ddof=1)) / math.sqrt(6)
-    assume(abs(gains.mean() - error) > 1e-6)
-    assert beyond_chance(unit * gains, 1.0) == (gains.mean() > error)
-
-
-@pytest.mark.parametrize(
-    ("means", "least_gain", "taken"),
-    [
-        ((1.5, 1.2, 1.0), 0.02, 2),
-        ((1.5, 1.015, 1.0), 0.02, 1),  # ahead by less than that
-        ((1.5, 1.015, 1.0), 0.0, 2),
-        ((1.5, 1.015, None), 0.02, 1),
-        ((None, None, 1.0), 0.02, 2),
-        ((1.0, 1.2, 0.5), 0.6, 0),
-        ((None, None), 0.02, None),
-    ],
-)
-def test_the_cheapest_candidate_that_the_best_does_not_lead_is_taken(
-    means: tuple[float | None, ...], least_gain: float, taken: int | None
-) -> None:
-    residuals = [None if mean is None else mean + SCATTER for mean in means]
-    assert cheapest_not_led(residuals, least_gain) == taken
-
-
-def test_a_lead_by_chance_is_none() -> None:
-    assert cheapest_not_led([1 + SCATTER, 0.9 - SCATTER], 0.0) == 0  # differs by 0.06 to 1.1 from view to view
-
-
-@pytest.mark.parametrize("ended", [np.full(5, np.inf), np.full(1, np.inf), np.full(5, np.nan)])
-def test_a_trial_that_was_ended_or_diverged_is_not_taken(ended: NDArray[np.float64]) -> None:
-    """As FBP where the time of trials ends in the search for the strength of patches."""
-    assert cheapest_not_led([ended, 2 + SCATTER, ended, 1 + SCATTER, ended]) == 3
-    assert cheapest_not_led([ended, 1 + SCATTER]) == 1
-    assert cheapest_not_led([ended]) is None
-
-
-@pytest.mark.parametrize("best", [-5, -1.3, 0, 0.4, 1, 2, 7])
-def test_the_strength_of_the_least_residual_is_found(best: float) -> None:
-    """A residual that is a parabola of the octave has its vertex where a parabola through three points has it."""
-    found = preferred_strength(lambda strength: 1 + (math.log2(strength / 3) - best) ** 2 + SCATTER, 3.0)
-    assert found is not None and found.strength == pytest.approx(3.0 * 2.0**best)
-    np.testing.assert_allclose(found.residuals, 1 + (round(best) - best) ** 2 + SCATTER)
-
-
-def test_from_strengths_that_change_nothing_the_search_goes_on_to_stronger_ones() -> None:
-    """As of a measured walnut of 25 views: level over three octaves, with a rise of 0.02 % each; then it falls."""
-    by_view = np.array([-1.0, 1.0, -1.0, 1.0, 0.0])
-
-    def residuals(strength: float) -> NDArray[np.float64]:
-        octave = math.log2(strength / 3)
-        mean = 1.08 + 0.0002 * octave if octave < 3 else 1 + abs(octave - 5) / 100
-        return mean + SCATTER + 0.01 * octave * by_view
-
-    found = preferred_strength(residuals, 3.0)
-    assert found is not None and found.strength == pytest.approx(3 * 32)
-
-
-def test_trials_that_were_ended_prefer_nothing() -> None:
-    assert preferred_strength(lambda _: np.full(5, np.inf), 3.0) is None
-
-
 def test_few_views_are_not_held_out() -> None:
     few = Geometry.parallel(np.linspace(0, 3, LEAST_VIEWS - 1), (4, 8))
-    assert HeldOutTrial.of(Mock(**{"projector.geometry": few})) is None
+    assert Trial.of(Mock(**{"projector.geometry": few})) is None
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +142,7 @@ def test_coarse_voxels_of_a_cone_get_the_weight_that_views_held_out_allow(
 ) -> None:
     data, geometry, grid, truth = coarse_cone
     found = recon.reconstruct(data, geometry, FistaTv(), grid=grid).volume.data
-    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: None)
     by_noise = recon.reconstruct(data, geometry, FistaTv(), grid=grid).volume.data
     assert psnr(truth, found) > psnr(truth, by_noise) + 0.5
 
@@ -302,8 +225,8 @@ def _problem_of(data: F32, geometry: Geometry, weights: F32 | None = None) -> Vo
     return given[0]
 
 
-def _trial_of(data: F32, geometry: Geometry, weights: F32 | None = None) -> HeldOutTrial:
-    trial = HeldOutTrial.of(_problem_of(data, geometry, weights))
+def _trial_of(data: F32, geometry: Geometry, weights: F32 | None = None) -> Trial:
+    trial = Trial.of(_problem_of(data, geometry, weights))
     assert trial is not None
     return trial
 
@@ -321,7 +244,7 @@ def test_columns_of_air_hardly_change_volumes_of_a_trial(
     data = lines + rng.normal(0, 0.3, lines.shape).astype(np.float32)
     weights = np.where(lines > 0, 0.2, 1).astype(np.float32) if weighted else None
     narrow = _trial_of(data, geometry, weights)
-    monkeypatch.setattr(held_out, "columns_of_matter", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.columns_of_matter", lambda *_: None)
     wide = _trial_of(data, geometry, weights)
     off = (wide.start.shape[0] - narrow.start.shape[0]) // 2
     assert off > 5
@@ -339,6 +262,6 @@ def test_all_views_get_the_weight_of_seven_eighths_by_the_root_of_their_number(
 ) -> None:
     """As much noise of a volume: without, -0.2 to -0.4 dB on bone and cement of 1000 photons."""
     problem = _problem_of(foam[0], foam[1])
-    monkeypatch.setattr(held_out, "preferred_strength", lambda *_: BestStrength(3.0, np.ones(5)))
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: BestStrength(3.0, np.ones(5)))
     start = problem.filtered("hann")
     assert start is not None and choose_weight(problem, start, 20) == pytest.approx(3 * math.sqrt(8 / 7))

@@ -81,7 +81,7 @@ def test_both_methods_make_the_same_of_a_porous_slice_in_a_fan(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the weight by the noise; OS-SIRT-TV was 5.9 dB below FISTA-TV on a slice of bone."""
-    monkeypatch.setattr("recon.voxels.held_out.preferred_strength", lambda *_: None)
+    monkeypatch.setattr("recon.voxels.trial.preferred_strength", lambda *_: None)
     n, views = 160, 50
     y, x = np.mgrid[: 2 * n, : 2 * n] - (n - 0.5)
     off = np.hypot(x, y)

@@ -16,10 +16,10 @@ from recon.base.method import DataUse, RunControl
 from recon.base.slabs import part_of, slabs_of
 from recon.base.volume import Grid
 from recon.reconstruction import reconstruct
-from recon.voxels import methods
 from recon.voxels.methods import PnpDct
 from recon.voxels.priors import pnp_dct, towards_views, views_on_device
 from recon.voxels.projector import Projector, projection_lines, volume_lines
+from recon.voxels.trial import choose_patches
 from recon.voxels.voxel_problem import VoxelProblem, largest_eigenvalue
 
 F32 = NDArray[np.float32]
@@ -122,9 +122,10 @@ def test_few_photons_get_the_strength_that_the_volume_needs(monkeypatch: pytest.
         volume = reconstruct(np.log(100 / counts).astype(np.float32), geometry, PnpDct(), use=use).volume
         return float(np.sqrt(np.mean((volume.data - truth) ** 2)))
 
-    chosen, choose = error(), methods.choose_patches
+    chosen = error()
     for times in (0.5, 2.0):
         monkeypatch.setattr(
-            methods, "choose_patches", lambda *a, t=times: (p := choose(*a))._replace(strength=t * p.strength)
+            "recon.voxels.methods.choose_patches",
+            lambda *a, t=times: (p := choose_patches(*a))._replace(strength=t * p.strength),
         )
         assert chosen < 1.02 * error()

@@ -13,8 +13,8 @@ from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.ray_width import RayWidth
 from recon.base.volume import Grid
-from recon.voxels.held_out import unseen_residuals
 from recon.voxels.projector import Projector
+from recon.voxels.residuals import unseen_residuals
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution, smoothed
 from recon.voxels.voxel_problem import largest_eigenvalue
 from tests.recon.helpers import assert_transpose

@@ -9,6 +9,7 @@ import pytest
 
 import recon
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.voxels.matter_checks import STRAY_LIMIT, seen_empty, stray_mass
 from tests.recon.voxels.test_projector import ellipsoid_shadow, smooth_ball
 
@@ -34,11 +35,11 @@ def scan(geometry: Geometry, rng: np.random.Generator, noise: float = 0.003) -> 
 def test_a_blob_where_views_show_nothing_is_all_that_is_stray(count: int, cone: bool, rng: np.random.Generator) -> None:
     geometry, truth = views(count, cone), smooth_ball(GRID, AXES, CENTRE)
     data = scan(geometry, rng)
-    clean = stray_mass(recon.Volume(truth, GRID), data, geometry)
-    assert clean is not None and clean.empty > 0.4 and clean.share == 0
+    clean = stray_mass(recon.Volume(truth, GRID), Views(data, geometry))
+    assert seen_empty(Views(data, geometry), GRID)[0].mean() > 0.4 and clean is not None and clean.share == 0
     spoiled = truth.copy()
     spoiled[BLOB] += 0.5
-    found = stray_mass(recon.Volume(spoiled, GRID), data, geometry)
+    found = stray_mass(recon.Volume(spoiled, GRID), Views(data, geometry))
     assert found is not None
     blob = 0.5 * 27 / spoiled.sum()
     assert 0.3 * blob < found.share < 1.001 * blob  # few of its voxels are past the ball in fewer than two views
@@ -51,7 +52,7 @@ def test_a_blob_where_views_show_nothing_is_all_that_is_stray(count: int, cone: 
 def test_no_voxel_of_matter_is_shown_to_be_empty(cone: bool, rng: np.random.Generator) -> None:
     geometry, truth = views(20, cone), smooth_ball(GRID, AXES, CENTRE)
     for noise in (0.0, 0.003, 0.03):
-        empty = seen_empty(scan(geometry, rng, noise), geometry, GRID)
+        empty, _ = seen_empty(Views(scan(geometry, rng, noise), geometry), GRID)
         assert not empty[truth > 0.5].any()
         assert empty.mean() > 0.4
 
@@ -61,9 +62,9 @@ def test_rays_that_were_not_measured_show_nothing(rng: np.random.Generator) -> N
     weights = np.ones((5, 32, 38), np.float32)
     weights[:, :, 24:] = 0
     data = scan(geometry, rng)
-    empty = seen_empty(data, geometry, GRID, weights)
-    assert 0 < empty.sum() < seen_empty(data, geometry, GRID).sum()
-    assert stray_mass(recon.Volume(np.zeros(GRID.shape, np.float32), GRID), data, geometry) is None
+    empty, _ = seen_empty(Views(data, geometry, weights), GRID)
+    assert 0 < empty.sum() < seen_empty(Views(data, geometry), GRID)[0].sum()
+    assert stray_mass(recon.Volume(np.zeros(GRID.shape, np.float32), GRID), Views(data, geometry)) is None
 
 
 @pytest.mark.parametrize("count", [5, 10])
@@ -72,7 +73,7 @@ def test_few_views_leave_less_in_the_air_of_a_fit_than_of_fbp(count: int, rng: n
     data = scan(geometry, rng, 0.02)
     shares = []
     for method in (recon.Fbp(), recon.R2(steps=60, gaussians=300, finish=4)):
-        found = stray_mass(recon.reconstruct(data, geometry, method, grid=GRID).volume, data, geometry)
+        found = stray_mass(recon.reconstruct(data, geometry, method, grid=GRID).volume, Views(data, geometry))
         assert found is not None
         shares.append(found.share)
     assert shares[0] > STRAY_LIMIT > 0.02 > shares[1]
@@ -90,7 +91,7 @@ def test_the_level_of_air_is_where_every_view_sees_none(axis: float, rng: np.ran
     for angle in geometry.angles:
         col = geometry.axis_col + (x * np.cos(angle) + y * np.sin(angle)) / 0.04
         level[(col < -1.5) | (col > 38.5)] = 7.0
-    found = stray_mass(recon.Volume(level, grid), scan(geometry, rng), geometry)
+    found = stray_mass(recon.Volume(level, grid), Views(scan(geometry, rng), geometry))
     assert found is not None and found.air.sum() > 1000
     mean, spread = found.level(recon.Volume(level, grid))
     assert mean == pytest.approx(-0.02, abs=1e-3) and spread < 2e-3

@@ -63,7 +63,7 @@ def test_opaque_matter_with_sharp_edges_in_bright_light_has_not_wrapped(light: f
 
 
 @pytest.mark.parametrize(("dtype", "light"), [(np.uint16, 7.2e4), (np.int16, 7.2e4), (np.int16, 9e4)])
-def test_validate_says_that_numbers_wrapped_and_nothing_of_the_light(dtype: type, light: float) -> None:
+def test_validate_says_that_numbers_wrapped_and_nothing_of_the_light(dtype: Any, light: float) -> None:
     """With a sign, 65,536 and more is again above 0, beside darker matter far below 0 without any step."""
     views, flats = counts(light, 0.1).repeat(6, axis=0), np.random.default_rng(5).poisson(light, (3, 32, 256)) + 400
     darks = np.random.default_rng(6).normal(400, 3, (3, 32, 256)).round()

@@ -1,4 +1,4 @@
-"""Truths and figures of merit: what is read, what fits, and what the numbers mean."""
+"""Truths: what is read, what fits, and volume files measured by them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,9 @@ import pytest
 import tifffile
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct import measure as module
-from beamline.reconstruct.measure import contrast_by, fit_truth, measure, measured_file, read_truth, regions
+from beamline.reconstruct.truth import fit_truth, measured_file, read_truth
 from recon.assess.metrics import ssim_of_whole_slices
-from recon.base.geometry import Geometry
-from recon.base.volume import Grid, Volume
-from recon.voxels.projector import project
-from recon.voxels.resolution import ViewResolution, at_voxel_resolution
-from tests.beamline.prepared_views import prepared_views
+from recon.base.volume import Grid
 
 DATA = np.arange(4 * 6 * 8, dtype=np.float32).reshape(4, 6, 8)
 
@@ -68,64 +62,6 @@ def test_a_finer_truth_is_averaged_onto_the_grid() -> None:
     np.testing.assert_array_equal(fit_truth(DATA, Grid(DATA.shape), 1).data, DATA)
     with pytest.raises(ConfigError, match=r"shape \(4, 6, 8\), the volume \(4, 6, 9\)"):
         fit_truth(DATA, Grid((4, 6, 9)), 1)
-
-
-def _prepared(volume: Volume, held_out: bool = False) -> PreparedProjections:
-    rows, _, cols = volume.grid.shape
-    geometry = Geometry.parallel(np.linspace(0, 3, 20), (rows, cols))
-    data = project(volume, geometry)
-    return prepared_views(data, geometry, held_out=(data, geometry) if held_out else None)
-
-
-def _views_and_as_seen(prepared: PreparedProjections, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Sixteen of the twenty views, which are compared, and these at the resolution of voxels."""
-    some = np.unique(np.linspace(0, 19, 16).round().astype(int))
-    views = prepared.projections.data[some].swapaxes(1, 2)
-    return views, at_voxel_resolution(views, ViewResolution.of(prepared.geometry.select(some), grid))
-
-
-def _ball(shape: tuple[int, int, int] = (12, 24, 24)) -> Volume:
-    grid = Grid(shape, 1.0)
-    z, y, x = np.meshgrid(*grid.coordinates(), indexing="ij")
-    return Volume((z**2 + y**2 + x**2 < 25).astype(np.float32), grid)
-
-
-def test_a_perfect_volume(rng: np.random.Generator) -> None:
-    truth = _ball()
-    noisy = Volume(truth.data + rng.normal(0, 0.01, truth.data.shape).astype(np.float32), truth.grid)
-    values = measure(noisy, _prepared(truth, held_out=True), truth)
-    assert set(values) == {"psnr", "ssim3d", "nrmse", "residual", "residual_held_out"}
-    assert values["psnr"] == pytest.approx(40, abs=0.2)  # noise of 1 % of the peak
-    assert values["residual"] < 0.05
-    prepared = _prepared(truth)
-    views, seen = _views_and_as_seen(prepared, truth.grid)
-    alone = np.linalg.norm(seen - views) / np.linalg.norm(views)  # its own projection, as views of that sharpness
-    assert measure(truth, prepared, truth)["residual"] == pytest.approx(alone, rel=1e-5)
-
-
-def test_without_a_truth_the_background_tells(rng: np.random.Generator) -> None:
-    ball = _ball()
-    noisy = Volume(ball.data + rng.normal(0, 0.01, ball.data.shape).astype(np.float32), ball.grid)
-    assert set(measure(noisy, _prepared(ball), None)) == {"residual"}
-    values = contrast_by(regions(noisy, 0), noisy)
-    assert set(values) == {"snr", "cnr"}
-    assert values["snr"] == pytest.approx(40, abs=1.5)  # 20 log10(1 / 0.01)
-    assert values["cnr"] == pytest.approx(40, abs=1.5)
-
-
-def test_bands_of_rows_stand_for_a_large_detector(monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> None:
-    """What is measured in four bands of sixteen of 200 rows, each slice alike, is what all rows give."""
-    ball = _ball((200, 24, 24))
-    flat = Volume(
-        np.repeat(ball.data[100:101], 200, axis=0) * rng.normal(1, 0.1, (24, 24)).astype(np.float32), ball.grid
-    )
-    prepared = _prepared(flat)
-    wrong = Volume(flat.data * np.linspace(0.8, 1.0, 24, dtype=np.float32), ball.grid)
-    whole = measure(wrong, prepared, None)["residual"]
-    monkeypatch.setattr(module, "RESIDUAL_RAYS", 4 * 16 * 24)
-    bands = module.residual_bands(ball.grid, prepared.geometry, np.ones(200))
-    assert [band.stop - band.start for band in bands] == [16] * 4 and bands[0].start > 0 and bands[-1].stop < 200
-    assert measure(wrong, prepared, None)["residual"] == pytest.approx(whole, rel=1e-5)
 
 
 def test_a_constant_truth_is_refused() -> None:

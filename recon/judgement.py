@@ -1,0 +1,152 @@
+"""Judgement: what a volume is worth by its views and, where there is one, by a truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Flag, auto
+from typing import NamedTuple
+
+import numpy as np
+
+from recon.assess import metrics
+from recon.base.arrays import F32
+from recon.base.geometry import Geometry
+from recon.base.method import Clock
+from recon.base.view_data import Views
+from recon.base.volume import Grid, Volume
+from recon.voxels.matter_checks import (
+    StrayMass,
+    Unexplained,
+    stray_mass,
+    stray_mass_memory,
+    stray_mass_share,
+    unexplained,
+    unexplained_memory,
+)
+from recon.voxels.odd_views import OddView, odd_views, odd_views_memory
+from recon.voxels.residuals import SquaresLeft, volume_left
+
+_VIEWS = 16  # of those used, whose residual is stated
+_ODD_VIEWS_WORK = 1.5  # projections of all rays
+_REGIONS, _REGION = 2**21, 12  # voxels at most of regions (`metrics.sampled`); bytes of a voxel
+
+
+class Aspect(Flag):
+    """What a volume is judged by, beside a truth.
+
+    RESIDUAL: what it leaves of up to 16 views used, and of all views held out. STRAY: mass where views show nothing.
+    FIT, with the residual: what a volume fitted to the views hides or has not explained. That is a uniform one beside
+    it, structure left in the views, views that do not fit.
+    """
+
+    RESIDUAL, STRAY, FIT = auto(), auto(), auto()
+
+
+class TimeLeft(NamedTuple):
+    """Whether there is time for so many seconds, by a clock."""
+
+    now: Clock = lambda: 0.0
+    leaves: Callable[[float], bool] = lambda seconds: True
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What a volume is worth.
+
+    Attributes:
+        figures: of merit, by name: psnr, ssim3d, nrmse by a truth; residual, residual_held_out, unexplained, stray by
+            views.
+        held_out: what the volume leaves of each view held out; None where there is none.
+        along_rows: what the volume and a uniform one leave, as of `volume_left`; None: not compared.
+        unexplained: structure that the volume leaves in the views; None where that is not known.
+        stray: mass where views show nothing; None where it was not looked for.
+        odd_views: with a part that the volume does not explain.
+        skipped: looks for which there was no time.
+        seconds_of_views: to project all views, about.
+    """
+
+    figures: Mapping[str, float]
+    held_out: SquaresLeft | None = None
+    along_rows: tuple[float, float] | None = None
+    unexplained: Unexplained | None = None
+    stray: StrayMass | None = None
+    odd_views: tuple[OddView, ...] = ()
+    skipped: tuple[str, ...] = ()
+    seconds_of_views: float = 0.0
+
+
+def judge(
+    volume: Volume,
+    views: Views,
+    truth: Volume | None = None,
+    *,
+    held_out: Views | None = None,
+    aspects: Aspect = Aspect.RESIDUAL,
+    seed: int = 0,
+    time: TimeLeft = TimeLeft(),  # noqa: B008 - a constant
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Judgement:
+    """Judge a volume by the views it was made of, those held out, and the true volume.
+
+    Args:
+        seed: of the signs of views by which noise is told from structure.
+        time: looks that would take longer than it leaves are skipped, those for stray mass and odd views.
+        progress: how many of how many views were compared.
+
+    Raises:
+        ValueError: the views are zero everywhere.
+    """
+    figures = {} if truth is None else by_truth(truth.data, volume.data)
+    along_rows, unseen, structure, stray, seconds = None, None, None, None, 0.0
+    odd, skipped, fitted = tuple[OddView, ...](), list[str](), Aspect.FIT in aspects
+    if Aspect.RESIDUAL in aspects:
+        begun = time.now()
+        left, along_rows = volume_left(volume, views, _VIEWS, progress, beside_uniform=fitted)
+        figures["residual"], projected = left.residual, left.rays.sum() * (3 if fitted else 1)
+        if held_out is not None:
+            unseen, _ = volume_left(volume, held_out, held_out.geometry.n_views, progress)
+            figures["residual_held_out"], projected = unseen.residual, projected + unseen.rays.sum()
+        seconds = (time.now() - begun) * views.data.size / float(projected)
+    if fitted and (structure := unexplained(volume, views, np.random.default_rng(seed))) is not None:
+        figures["unexplained"] = structure.share
+
+    def has_time(work: float, name: str) -> bool:
+        """Whether there is time for as much work as that of projecting all views so often."""
+        enough = work == 0 or time.leaves(work * seconds)
+        skipped.extend([] if enough else [name])
+        return enough
+
+    work = stray_mass_share(views.geometry, volume.grid)
+    if Aspect.STRAY in aspects and has_time(work, "the look for mass where views show nothing"):
+        stray = stray_mass(volume, views)
+        figures |= {} if stray is None else {"stray": stray.share}
+    if fitted and has_time(_ODD_VIEWS_WORK, "the look for views that do not fit the volume"):
+        odd = odd_views(volume, views, progress)
+    return Judgement(figures, unseen, along_rows, structure, stray, odd, tuple(skipped), seconds)
+
+
+def judge_memory(geometry: Geometry, *, fitted: bool) -> int:
+    """Approximate memory of `judge` and `contrast` in bytes, without projections and volume."""
+    grid = Grid.matching(geometry)
+    most = max(unexplained_memory(geometry), stray_mass_memory(geometry, grid), fitted * odd_views_memory(geometry))
+    return max(most, _REGION * min(math.prod(grid.shape), _REGIONS))
+
+
+def by_truth(truth: F32, volume: F32) -> dict[str, float]:
+    """The figures of a volume by the true one, [z, y, x] each."""
+    of = {"psnr": metrics.psnr, "ssim3d": metrics.ssim3d, "nrmse": metrics.nrmse}
+    return {name: float(figure(truth, volume)) for name, figure in of.items()}
+
+
+def contrast(reference: Volume, volumes: Mapping[str, Volume], seed: int) -> dict[str, dict[str, float]]:
+    """SNR and CNR of each volume in the dense and the empty regions of one reference, without their rims.
+
+    Regions of each volume itself would be others. Empty if the reference has no such regions.
+    """
+    regions = metrics.interior_regions(metrics.sampled(reference.data), seed)
+    if regions is None:
+        return {}
+    figures = {name: metrics.snr_cnr(metrics.sampled(each.data), regions) for name, each in volumes.items()}
+    return {name: {"snr": snr, "cnr": cnr} for name, (snr, cnr) in figures.items()}

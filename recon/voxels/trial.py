@@ -1,0 +1,372 @@
+"""Trial: volumes of seven of eight views on some rows, judged by the views held out, and the priors found so.
+
+A trial makes each candidate's volume from the views that are not held out, measures its residual of each one that is,
+and compares candidates by the rule of `recon.voxels.choice`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F32, F64
+from recon.base.decisions import Decisions, Prior
+from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, ONE_IN
+from recon.base.geometry import Geometry
+from recon.base.method import Clock, Method, ReconProblem, RunControl
+from recon.base.view_data import split_views
+from recon.base.volume import Grid, Volume
+from recon.voxels.choice import LEAST_GAIN, BestStrength, Choice, Prediction, preferred_strength
+from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
+from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, TRIAL_SWEEPS
+from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
+from recon.voxels.projector import volume_lines
+from recon.voxels.residuals import unseen_residuals
+from recon.voxels.voxel_problem import VoxelProblem, times_power
+
+_WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one
+SUBSETS, TV_STEPS = 9, 3  # of a trial
+PATCH_STEPS = 35
+"""Steps with sparse patches of a trial, and by default of `PnpDct`."""
+
+
+def _trial_rows(geometry: Geometry, grid: Grid) -> int:
+    """Rows of a trial: fewer in a box that is wider than the field, so that it takes no longer."""
+    share = 2 * geometry.reach / (grid.shape[2] * grid.voxel_size)
+    return TRIAL_ROWS if share > _WIDE else max(_FEWEST_ROWS, round(TRIAL_ROWS * share))
+
+
+def choose_weight(
+    problem: VoxelProblem, start: F32 | None, sweeps: int, trial: Callable[[], Trial | None] | None = None
+) -> NoiseBalance | float:
+    """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0: by held-out views, if there are any, else by the noise.
+
+    μ over the number of views follows the noise of a volume, which falls with the root of that number. So μ is √(8/7)
+    times that of the trial. It is sought from FBP: a fit knows the views held out, and any weight takes it away from
+    them.
+
+    Args:
+        start, sweeps: as of `NoiseBalance.of`.
+        trial: gives that of this problem; None: `Trial.of`.
+    """
+
+    def chosen() -> list[float]:
+        if problem.prior is not None:
+            return [problem.prior.weight]
+        balance = NoiseBalance.of(problem, start, sweeps)
+        judge = (trial() if trial else Trial.of(problem)) if balance.first > 0 else None
+        best = None if judge is None else judge.best_weight(balance.first)
+        return [balance.first, balance.noise] if best is None else [best.strength]
+
+    first, *noise = problem.decide("weight", chosen)
+    return NoiseBalance(first, noise[0], sweeps) if noise else first
+
+
+class Patches(NamedTuple):
+    """The settings of sparse patches chosen by held-out views.
+
+    Attributes:
+        strength: of `pnp_dct`.
+        better: patches predict these views better than total variation alone.
+    """
+
+    strength: float
+    better: bool
+
+
+def choose_patches(
+    problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], Trial | None], steps: int
+) -> Patches:
+    """The strength of `pnp_dct` chosen by held-out views, from volumes of total variation with a weight μ.
+
+    Trials take as many steps as the volume will: noise enters with each, so that few steps prefer a weaker prior.
+
+    The search begins at the noise that a volume of all views has without a prior. That is also the strength where no
+    views can be held out. There total variation is taken to predict as well. Neither knows of the densest matter: weak
+    matter beside metal keeps its detail.
+    """
+
+    def chosen() -> list[float]:
+        if problem.prior is not None and problem.prior.strength:
+            return [problem.prior.strength, problem.prior.patches]
+        judge = None if isinstance(weight, NoiseBalance) else trial()
+        first = FIRST_THRESHOLD * noise_of_volume(problem if judge is None else judge.problem)
+        if judge is None or isinstance(weight, NoiseBalance) or first == 0:
+            return [first, 0]
+        best = judge.best_patches(weight, first, steps)
+        if best is None:
+            return [first, 0]
+        return [best.strength, bool(best.residuals.mean() < judge.of_weight(weight).mean())]
+
+    strength, better = problem.decide("strength", chosen)
+    return Patches(strength, bool(better))
+
+
+@dataclass(frozen=True)
+class TrialSettings:
+    """The run that a trial belongs to.
+
+    Attributes:
+        wide: the grid holds a sample beyond the field.
+        all_rows: of a cone whose middle shows little matter all rows are tried, here in words, and pixels may be joined
+            for that: priors found so are not those of the volume. Empty: some rows.
+        now: the clock.
+    """
+
+    wide: bool = False
+    all_rows: str = ""
+    now: Clock = time.perf_counter
+
+
+_USUAL = TrialSettings()
+
+
+@runtime_checkable
+class Predicting(Method, Protocol):
+    """A method that tells by a part of its work how well its volume predicts views held out."""
+
+    def predict(self, trial: Trial, so_far: Choice) -> Prediction:
+        """The prediction of its volume; `so_far` has those of simpler candidates."""
+
+
+class AllColumns(NamedTuple):
+    """The rows of a trial with all columns, including air: a fit of narrower views is poorer.
+
+    Attributes:
+        cols: those of the trial.
+        seen: makes the problem of the views that are not held out.
+        unseen: the geometry of those that are.
+    """
+
+    cols: slice
+    seen: Callable[[], VoxelProblem]
+    unseen: Geometry
+
+
+class Trial:
+    """Volumes of a slab from seven of eight views, judged by the others: which candidate predicts them.
+
+    Attributes:
+        problem: of the slab.
+        scan: of all rows.
+        start: [y, x, z], the first volume: FBP, or none where no direct method takes the views.
+        unseen: the views held out.
+        all_columns: both with all columns.
+        smooth: the volume of total variation that predicts these best, of those made so far.
+        settings: of the run that the trial belongs to.
+    """
+
+    def __init__(
+        self, scan: VoxelProblem, slab: VoxelProblem, start: F32, unseen: VoxelProblem, all_columns: AllColumns,
+        settings: TrialSettings,
+    ) -> None:  # fmt: skip
+        self.scan, self.problem, self.start = scan, replace(slab, go_on=self._go_on), start
+        self.unseen, self.all_columns, self.settings = unseen, all_columns, settings
+        subsets = subsets_of(scan.projector.geometry, SUBSETS, FEWEST_SUBSETS)
+        self._subsets = Subsets.of(slab, subsets, subsets)
+        self._ended, self._least = False, math.inf
+        self._known: dict[tuple[str, float], F64] = {}
+        self.smooth: F32 | None = None
+
+    @classmethod
+    def of(cls, problem: VoxelProblem, settings: TrialSettings = _USUAL) -> Trial | None:
+        """The trial of the rows with most matter; for a cone beam of those in the middle.
+
+        Columns of air far beside the sample are left out.
+
+        None: fewer than 16 views, a cone as `middle_of_cone`, views held out that weigh nothing in these rows, or
+        `problem.trial_goes_on` ends it.
+        """
+        geometry, grid = problem.projector.geometry, problem.projector.grid
+        if geometry.n_views < LEAST_VIEWS or not problem.trial_goes_on():
+            return None
+        images = problem.data.swapaxes(1, 2)
+        if not geometry.is_cone:
+            rows = busiest_rows(images, _trial_rows(geometry, grid))
+            views, box = slab_of(geometry, grid, rows.start, rows.stop)
+            return cls._of_rows(problem, settings, rows, views, box, columns_of_matter(views, box, images[:, rows]))
+        height = _trial_rows(geometry, grid)
+        if settings.all_rows or geometry.detector_shape[0] <= height:
+            return cls._of_rows(problem, settings, slice(0, geometry.detector_shape[0]), geometry, grid)
+        middle = middle_of_cone(geometry, grid, images, height)
+        return None if middle is None else cls._of_rows(problem, settings, *middle)
+
+    @classmethod
+    def _of_rows(
+        cls, problem: VoxelProblem, settings: TrialSettings, rows: slice, views: Geometry, box: Grid,
+        matter: tuple[slice, Geometry, Grid] | None = None,
+    ) -> Trial | None:  # fmt: skip
+        def of_views(chosen: NDArray[np.intp], cols: slice, views: Geometry, box: Grid) -> VoxelProblem:
+            def cut(rays: F32) -> F32:
+                return np.ascontiguousarray(rays[chosen][:, cols, rows])
+
+            return replace(
+                problem,
+                projector=replace(problem.projector, geometry=views.select(chosen), grid=box),
+                data=cut(problem.data),
+                measured=None if problem.measured is None else cut(problem.measured),
+                weight=None if problem.weight is None else cut(problem.weight),
+                rng=np.random.default_rng(0),
+                go_on=lambda *_: True,
+                decide=Decisions(),
+            )
+
+        cols, narrow, narrow_box = matter or (slice(None), views, box)
+        seen, unseen = (of_views(some, cols, narrow, narrow_box) for some in split_views(views))
+        if unseen.weight is not None and not unseen.weight.any(axis=(1, 2)).any():
+            return None
+        first = seen.filtered("hann")
+        if first is None:  # no direct method takes these views
+            depth, height, width = narrow_box.shape
+            first = np.zeros((height, width, depth), np.float32)
+        others, judges = split_views(views)
+        all_columns = AllColumns(cols, partial(of_views, others, slice(None), views, box), views.select(judges))
+        part = replace(seen, with_all_columns=all_columns.seen if matter else None)
+        return cls(problem, part, np.maximum(first, 0, out=first), unseen, all_columns, settings)
+
+    def _go_on(self, sweep: int, residual: float) -> bool:
+        self._ended = self._ended or not self.problem.trial_goes_on()
+        return not self._ended
+
+    @property
+    def ended(self) -> bool:
+        """Whether the trials were stopped; no further volume is assessed."""
+        return self._ended
+
+    def residuals_of(self, prior: str, strength: float, volume: Callable[[float], F32]) -> F64:
+        """Residuals for this prior and strength; each volume is made once."""
+        if (prior, strength) not in self._known:
+            x = volume(strength)
+            residuals = self._known[prior, strength] = self.residuals(x)
+            if prior == "weight" and residuals.mean() < self._least:
+                self.smooth, self._least = x, float(residuals.mean())
+        return self._known[prior, strength]
+
+    def best_weight(self, first: float) -> BestStrength | None:
+        """The weight μ of total variation for all views, searched from `first`; None: the trials were ended."""
+        best = preferred_strength(self.of_weight, first)
+        if best is None:
+            return None
+        of_all = replace(best, strength=best.strength * math.sqrt(ONE_IN / (ONE_IN - 1)))
+        self._known["weight", of_all.strength] = best.residuals
+        return of_all
+
+    def best_patches(self, weight: float, first: float, steps: int) -> BestStrength | None:
+        """The strength of so many steps with patches after total variation, searched from `first`; None: as above."""
+        smooth = self.with_weight(weight) if self.smooth is None else self.smooth
+
+        def made(strength: float) -> F32:
+            return self.volume_by(lambda part, first: pnp_dct(part, first, strength, steps=steps), smooth)
+
+        best = preferred_strength(lambda strength: self.residuals_of("patches", strength, made), first)
+        if best is not None:
+            self._known["patches", best.strength] = best.residuals
+        return best
+
+    @cached_property
+    def weight(self) -> float | None:
+        """The weight of total variation of all views, in the units of the problem; None: by the noise."""
+        weight = choose_weight(self.scan, None, 0, lambda: self)
+        return None if isinstance(weight, NoiseBalance) else weight
+
+    @cached_property
+    def prior(self) -> Prior | None:
+        """The weight of all views, and patches after it; None: as of `weight`."""
+        if self.weight is None:
+            return None
+        return Prior(self.weight, *choose_patches(self.scan, self.weight, lambda: self, PATCH_STEPS))
+
+    def compare(self, candidates: Sequence[Method], least_gain: float = LEAST_GAIN) -> Choice:
+        """Which candidate predicts the views held out; one that does not take them is not tried.
+
+        A candidate is run as it is, on the views that are not held out, unless it has a method `predict`, which tells
+        its residuals by a part of the work.
+
+        Args:
+            candidates: the simplest and cheapest first.
+        """
+        rows = self.unseen.projector.geometry.detector_shape[0]
+        choice = Choice(self.settings.all_rows or f"{rows} rows", least_gain)
+        for each in candidates:
+            try:
+                prediction = each.predict(self, choice) if isinstance(each, Predicting) else self.predicted(each)
+            except ValueError as error:
+                prediction = Prediction(each.name, remark=f"{each.name}: {error}")
+            choice = choice.after(prediction)
+        return choice
+
+    def predicted(self, method: Method) -> Prediction:
+        """The prediction of a method's own volume of the views that are not held out."""
+        views = self.views_of(method)
+        made = method.run(views, self.control)
+        return self.prediction(method.name, self.residuals(self.lines_of(made.volume)))
+
+    def prediction(self, name: str, residuals: F64 | None, prior: Prior | None = None, remark: str = "") -> Prediction:
+        """A prediction in the units of the scan; `prior` in those of the problem."""
+        units, weighed = self.problem.units, self.problem.weight is not None
+        of_scan = None if prior is None or self.settings.all_rows else units.prior(prior, weighed, 1)
+        left = None if residuals is None else self.in_line_integrals(residuals).tolist()
+        return Prediction(name, left, of_scan, remark)
+
+    def in_line_integrals(self, residuals: F64) -> F64:
+        """Residuals in the units of the scan, the root of weights included."""
+        units, weighed = self.problem.units, self.problem.weight is not None
+        return np.asarray(residuals * 2.0 ** (units.integral + weighed * units.weight / 2))
+
+    @property
+    def control(self) -> RunControl:
+        """The control of a run that counts as one of the trials."""
+        return RunControl(lambda: not self._go_on(0, 0.0), now=self.settings.now)
+
+    def views_of(self, method: Method) -> ReconProblem:
+        """The views that are not held out as a method gets them, with all columns and in the units of the scan."""
+        problem = self.all_columns.seen().of_scan
+        device = problem.device if method.traits.device else "cpu"
+        return replace(problem, device=device, wide=self.settings.wide)
+
+    def lines_of(self, volume: Volume) -> F32:
+        """A volume made of `views_of` as one of the trial, [y, x, z]."""
+        shape = self.problem.projector.grid.shape
+        y, x = ((many - few) // 2 for many, few in zip(volume.data.shape[1:], shape[1:], strict=True))
+        part = np.maximum(volume.data[:, y : y + shape[1], x : x + shape[2]], 0)
+        return times_power(volume_lines(part), -self.problem.units.density)
+
+    def of_weight(self, weight: float) -> F64:
+        """Residuals for total variation of this weight; `smooth` is the best volume of all weights."""
+        return self.residuals_of("weight", weight, self.with_weight)
+
+    def of_patches(self, strength: float) -> F64 | None:
+        """Residuals for patches of this strength; None: it was not tried."""
+        return self._known.get(("patches", strength))
+
+    def with_weight(self, weight: float) -> F32:
+        """The volume of total variation with this weight."""
+        return self.volume_by(lambda part, x: ordered_fista(
+            part, x, weight, self._subsets, sweeps=TRIAL_SWEEPS, tv_steps=TV_STEPS
+        ))  # fmt: skip
+
+    def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
+        """The volume that `make` computes from a copy of the first one; that copy once the trials ended."""
+        x = (self.start if start is None else start).copy()
+        if self._ended:
+            return x
+        return make(replace(self.problem, rng=np.random.default_rng(0)), x)  # the same order of subsets for all
+
+    def residuals(self, x: F32, beyond: F32 | None = None) -> F64:
+        """`unseen_residuals` of a volume [y, x, z]; infinite if the trials were stopped.
+
+        Args:
+            beyond: [view held out, col, row], what its model adds to its projection.
+        """
+        unseen = self.unseen
+        if self._ended:
+            return np.full(len(unseen.data), np.inf)
+        views = unseen.views if beyond is None else unseen.views - beyond
+        return unseen_residuals(unseen.projector.forward_lines(x), views, unseen.weight, unseen.projector.resolution)

@@ -1,0 +1,106 @@
+"""The rule of every choice, on residuals by hand, and the search for a strength."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from recon.base.decisions import Prior
+from recon.voxels.choice import (
+    Choice,
+    Prediction,
+    exceeds_standard_error,
+    preferred_strength,
+    simplest_within_one_se,
+)
+
+SCATTER = np.array([-0.3, 0.1, 0.4, -0.2, 0.0])  # of views, which all candidates share
+
+
+@given(arrays(np.float64, 6, elements=st.floats(-1.0, 1.0)), st.floats(0.1, 10.0))
+def test_beyond_chance_is_more_than_a_standard_error_in_any_unit(gains: NDArray[np.float64], unit: float) -> None:
+    error = float(gains.std(ddof=1)) / math.sqrt(6)
+    assume(abs(gains.mean() - error) > 1e-6)
+    assert exceeds_standard_error(unit * gains, 1.0) == (gains.mean() > error)
+
+
+@pytest.mark.parametrize(
+    ("means", "least_gain", "taken"),
+    [
+        ((1.5, 1.2, 1.0), 0.02, 2),
+        ((1.5, 1.015, 1.0), 0.02, 1),  # ahead by less than that
+        ((1.5, 1.015, 1.0), 0.0, 2),
+        ((1.5, 1.015, None), 0.02, 1),
+        ((None, None, 1.0), 0.02, 2),
+        ((1.0, 1.2, 0.5), 0.6, 0),
+        ((None, None), 0.02, None),
+    ],
+)
+def test_the_cheapest_candidate_that_the_best_does_not_lead_is_taken(
+    means: tuple[float | None, ...], least_gain: float, taken: int | None
+) -> None:
+    residuals = [None if mean is None else mean + SCATTER for mean in means]
+    assert simplest_within_one_se(residuals, least_gain) == taken
+
+
+def test_a_lead_by_chance_is_none() -> None:
+    assert simplest_within_one_se([1 + SCATTER, 0.9 - SCATTER], 0.0) == 0  # differs by 0.06 to 1.1 from view to view
+
+
+@pytest.mark.parametrize("ended", [np.full(5, np.inf), np.full(1, np.inf), np.full(5, np.nan)])
+def test_a_trial_that_was_ended_or_diverged_is_not_taken(ended: NDArray[np.float64]) -> None:
+    """As FBP where the time of trials ends in the search for the strength of patches."""
+    assert simplest_within_one_se([ended, 2 + SCATTER, ended, 1 + SCATTER, ended]) == 3
+    assert simplest_within_one_se([ended, 1 + SCATTER]) == 1
+    assert simplest_within_one_se([ended]) is None
+
+
+@pytest.mark.parametrize("best", [-5, -1.3, 0, 0.4, 1, 2, 7])
+def test_the_strength_of_the_least_residual_is_found(best: float) -> None:
+    """A residual that is a parabola of the octave has its vertex where a parabola through three points has it."""
+    found = preferred_strength(lambda strength: 1 + (math.log2(strength / 3) - best) ** 2 + SCATTER, 3.0)
+    assert found is not None and found.strength == pytest.approx(3.0 * 2.0**best)
+    np.testing.assert_allclose(found.residuals, 1 + (round(best) - best) ** 2 + SCATTER)
+
+
+def test_from_strengths_that_change_nothing_the_search_goes_on_to_stronger_ones() -> None:
+    """As of a measured walnut of 25 views: level over three octaves, with a rise of 0.02 % each; then it falls."""
+    by_view = np.array([-1.0, 1.0, -1.0, 1.0, 0.0])
+
+    def residuals(strength: float) -> NDArray[np.float64]:
+        octave = math.log2(strength / 3)
+        mean = 1.08 + 0.0002 * octave if octave < 3 else 1 + abs(octave - 5) / 100
+        return mean + SCATTER + 0.01 * octave * by_view
+
+    found = preferred_strength(residuals, 3.0)
+    assert found is not None and found.strength == pytest.approx(3 * 32)
+
+
+def test_trials_that_were_ended_prefer_nothing() -> None:
+    assert preferred_strength(lambda _: np.full(5, np.inf), 3.0) is None
+
+
+def test_a_choice_is_the_same_from_a_file() -> None:
+    """Other slabs of a volume follow that of the first one."""
+    choice = Choice("16 rows", 0.02)
+    for prediction in (
+        Prediction("fbp", remark="fbp: not these"),
+        Prediction("fista-tv", (2 + SCATTER).tolist(), Prior(0.1)),
+        Prediction("r2", (1 + SCATTER).tolist(), None, "r2 stopped"),
+    ):
+        choice = choice.after(prediction)
+    assert (choice.at, choice.prior) == (2, None)
+    assert choice.reason.startswith("trials on 16 rows, root mean square left of views held out")
+    assert choice.reason.endswith("fista-tv 2; r2 1; fbp: not these; r2 stopped")
+    again = Choice.of(json.loads(json.dumps(choice)))
+    assert (again.at, again.reason) == (choice.at, choice.reason)
+    assert again.predictions[1].prior == Prior(0.1)
+    assert again.least is not None and again.least.mean() == pytest.approx(1.0)
+    assert Choice("no views").at is None and Choice("no views").reason == "no views"
