@@ -1,47 +1,23 @@
-"""Rules on the order in which frames are stored: bytes of a number, dimensions of a stack, direction of the axis."""
+"""Rules on the order in which frames are stored: dimensions of a stack, direction of the axis."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules import Finding
-from beamline.storage.rules.pixels import SHAPES, sample
-from drivers.base.frame import FrameKind
+from beamline.storage.rules.pixels import SHAPES
 from recon.base.views import spread
 from recon.prep.unmeasured import with_borders_filled
 
 _TURNED = 12  # views by which the direction of the axis is found
 _LEAST = 8  # views, rows and columns: fewer tell nothing of it
-_SWAPPED = 2.0  # times as rough as with bytes exchanged; sound counts are smoother than that
 _LEAST_SQUARE = 16  # views and rows, as many
 _ON_A_SINE, _OFF_A_SINE, _OTHER_MASS = 0.9, 4.0, 4.0  # share of a change; times what is left of it; times a variance
 _HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
-
-
-def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
-    """Counts have the byte order and sign of their type; counts beyond a signed type are read as unsigned."""
-    views = sample(source, FrameKind.PROJECTION) if source.dtype.kind in "ui" and source.dtype.itemsize > 1 else None
-    if views is not None and _roughness(views) > _SWAPPED * _roughness(views.astype(source.dtype).byteswap()):
-        yield Finding(
-            "error",
-            "pixels",
-            "From pixel to pixel the counts change without order, as bytes do that are read in the wrong order; with "
-            "the bytes of each number exchanged they are smooth. Write the images with the other order of bytes "
-            "(numpy: images.byteswap()).",
-        )
-    if wrapped := source.attributes.get("pixels"):
-        yield Finding("warning", "pixels", f"The label of the pixels is wrong or missing: they are {wrapped}.")
-
-
-def _roughness(views: NDArray[Any]) -> float:
-    """Change from pixel to pixel over the spread of all; 0 where they are all the same."""
-    spread_of_all = float(views.std())
-    return float(np.abs(np.diff(views.astype(np.float64), axis=2)).mean()) / spread_of_all if spread_of_all else 0.0
 
 
 def axis_vertical(source: ScanSource) -> Iterator[Finding]:

@@ -16,7 +16,7 @@ from beamline.features.files.validate import validate
 from beamline.storage.readers.base import Quantity
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules import Finding
-from beamline.storage.rules.stored_order import change_of_rows, pixels_as_labelled, views_first
+from beamline.storage.rules.stored_order import change_of_rows, views_first
 from tests.beamline.array_source import ArraySource
 from tests.recon.prep.balls import Balls
 
@@ -56,17 +56,6 @@ def counts(seed: int, light: float, dtype: type) -> ArraySource:
     rng = np.random.default_rng(seed)
     lines, angles = line_integrals(seed, np.pi)
     return ArraySource(rng.poisson(light * np.exp(-lines.clip(0)) + 100).astype(dtype), [0] * N, angles)
-
-
-@pytest.mark.parametrize("dtype", [np.uint16, np.int16, np.uint32])
-@pytest.mark.parametrize("light", [800.0, 3000.0, 20000.0])
-def test_counts_with_their_bytes_in_the_other_order(light: float, dtype: type) -> None:
-    source = counts(1, light, dtype)
-    assert list(pixels_as_labelled(source)) == []
-    swapped = ArraySource(source._data.byteswap(), [0] * N, source.table.angles)
-    (finding,) = pixels_as_labelled(swapped)
-    assert finding.severity == "error"
-    assert "byteswap" in finding.message
 
 
 def _lopsided(views: int, rows: int, cols: int) -> np.ndarray:
