@@ -35,12 +35,11 @@ from beamline.reconstruct.run import binned, run_on
 from recon.assess import metrics
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
-from recon.base.method import RunControl, SampleRadius
+from recon.base.method import Reconstruction, RunControl, SampleRadius
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
 from recon.judgement import judge
 from recon.prep.correct import Projections
-from recon.reconstruction import Reconstruction
 from recon.warm_up import warm_up
 
 DATA, VOLUME = "data", "volume.npy"
