@@ -19,7 +19,7 @@ from beamline.storage.rules.angles import angles_known, angles_spread
 from beamline.storage.rules.angles_shown import angles_shown
 from beamline.storage.rules.light import exposures_agree, light_one, one_energy, views_scaled
 from beamline.storage.rules.pixels import darks_measured, numbers_wrapped, pixels_measured, quantity_stated
-from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelled, sinogram_said, views_first
+from beamline.storage.rules.stored_order import axis_vertical, pixels_as_labelled, sinogram_told, views_first
 from drivers.base.frame import FrameKind
 
 VARYING = "lengths"  # a rule on those that differ from view to view
@@ -181,7 +181,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     views_scaled,
     axis_vertical,
     views_first,
-    sinogram_said,
+    sinogram_told,
     series_complete,
     scale_known,
     pixels_square,
