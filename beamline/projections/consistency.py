@@ -19,13 +19,11 @@ from beamline.projections.selection import Selection
 from beamline.projections.tilt import MATTERS, tilt_text
 from beamline.projections.views import refuse
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules import Finding
 from beamline.storage.rules.light import WARN, light_beside_flats
 from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, F64, median_deviation
 from recon.base.geometry import Geometry
 from recon.base.noise import NOISE_VIEWS, noise_level
-from recon.base.units import look_negative
 from recon.base.views import spread
 from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
@@ -54,10 +52,6 @@ _FAINT = 0.3  # line integral: of matter fainter than that, as much as the air m
 _FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
 _AIR = 0.1  # of the deepest line integral: as much as an edge may have where the sample is in the field
 _SURE = 4.0  # standard deviations
-_INVERTED = (
-    "Where the sample is, the views are brighter than the air beside it, and line integrals are below 0: were images "
-    "stored with dark and bright exchanged, or of flats with another sample? Give them as the camera wrote them."
-)
 # Least changes that are reported: rows, shares of absorption, width, height; 369 scans at rest reach 5.2 sigmas.
 _REPEATED, _REPEATED_SIGMAS = np.array([0.5, 0.06, 0.025, 0.03]), 6.0
 _SCALED = ", as one also seems to where the pixel size differs from view to view"  # in width and height alike
@@ -173,10 +167,7 @@ def compare_with_flats(
         ]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
-    found = list(light_beside_flats(source, groups, level, air, accepted or said or not refused))
-    if air and look_negative(projections.data):
-        found.append(Finding("warning", "light", _INVERTED))
-    for finding in found:
+    for finding in light_beside_flats(source, groups, level, air, accepted or said or not refused):
         refuse(source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}

@@ -326,7 +326,8 @@ class ScanFollower:
                 "`beamline recon` on the finished file leaves out the views of the shorter side."
             )
         wide = self.source.table.wide_views
-        why = _OUTDATED if self._correction.outdated else _WIDE if wide.size else _SEVERAL_PARTS
+        parts = self.source.table.part_starts.size
+        why = _SEVERAL_PARTS if parts > 1 else _OUTDATED if self._correction.outdated else _WIDE
         self.correct_again(usable, why, wide)
         return self._prepared(self.axis_col, usable)
 

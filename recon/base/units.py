@@ -76,7 +76,9 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
     """
     if projections.ndim != 3 or projections.shape[0] < 2 or not projections.shape[1] or projections.shape[2] < 16:
         return False
-    some, cols = _some(projections), projections.shape[2]
+    views, rows, cols = projections.shape
+    looked_at = max(_VIEWS, _VALUES // (min(rows, _ROWS) * cols))
+    some = projections[spread(np.arange(views), looked_at)][:, spread(np.arange(rows), _ROWS)].astype(np.float32)
     some[~np.isfinite(some)] = np.nan
     width, middle = cols // _EDGE or 1, some[..., cols // 3 : cols - cols // 3]
     edges = np.concatenate([some[..., :width], some[..., -width:]])
@@ -100,37 +102,6 @@ def look_like_transmission(projections: NDArray[np.floating]) -> bool:
     uncertain = 2 * noise / np.sqrt(np.isfinite(edges[air]).sum())  # of a difference of two medians of the edges
     flat = fall / _EDGE  # a profile that is convex falls twice as much from the edge to the columns beside it
     return bool(step < flat and flat > max(_SIGMAS * uncertain, 1e-4 * beam))
-
-
-def _some(projections: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Views and rows of [view, row, col], evenly spread, as an array of its own."""
-    views, rows, cols = projections.shape
-    looked_at = max(_VIEWS, _VALUES // (min(rows, _ROWS) * cols))
-    return projections[spread(np.arange(views), looked_at)][:, spread(np.arange(rows), _ROWS)].astype(np.float32)
-
-
-def look_like_light(projections: NDArray[np.floating]) -> bool:
-    """Whether values [view, row, col] given as line integrals look like transmission of a brighter beam, such as counts
-    or percent: far above 1 at the edges of the views, and lower behind the sample.
-    """
-    if projections.ndim != 3 or not projections.size:
-        return False
-    some, edge = _some(projections), projections.shape[2] // _EDGE or 1
-    sides = np.concatenate([some[..., :edge].ravel(), some[..., -edge:].ravel()])
-    level = float(np.median(sides[np.isfinite(sides)])) if np.isfinite(sides).any() else 0.0
-    return level > _OPAQUE and look_like_transmission(some / np.float32(level))
-
-
-def look_negative(projections: NDArray[np.floating]) -> bool:
-    """Whether values [view, row, col] given as line integrals look like their negatives: the logarithm of transmission,
-    which is 0 beside the sample and negative behind it. Differences of views have both signs.
-    """
-    if projections.ndim != 3 or not projections.size:
-        return False
-    some = _some(projections)
-    if np.nansum(some, dtype=np.float64) >= -np.nansum(np.abs(some), dtype=np.float64) / 2:
-        return False
-    return look_like_transmission(np.exp(np.clip(some, -_OPAQUE, 1)))
 
 
 def warn_of_other_quantity(projections: NDArray[np.floating], stacklevel: int = 3) -> None:

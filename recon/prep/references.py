@@ -44,7 +44,7 @@ class References:
     part_starts: tuple[int, ...] = (0,)
 
     def __post_init__(self) -> None:
-        some = np.ma.filled(self.flats[0][1], 0) if self.flats else np.zeros(0)
+        some = np.ma.filled(self.flats[0][1], 0) if isinstance(self.flats, tuple) and self.flats else np.zeros(0)
         light = float(np.nanpercentile(some, _BRIGHT)) if np.size(some) else 0.0
         object.__setattr__(self, "dark", _mean(self.dark, "darks", light))
         check_settings(self)

@@ -73,8 +73,9 @@ class OwnScan(NexusSource):
         n = int(committed[()])
         if n < 0:
             raise ValueError(f"{n} frames are committed")
-        if n > self.n:
-            hdf5.look_again(self._places.data)
+        if n > self.n:  # those that are open here: HDF5 2.0 reads wrong values if another handle refreshes them
+            for item in {self._places.data, self._places.image_key, self._places.angle} - {None}:
+                hdf5.look_again(item)
         if len(self._places.data) < n:
             raise DataError(f"{self.path} has {len(self._places.data)} frames; expected {n}.")
         return n

@@ -42,8 +42,6 @@ from beamline.storage.readers.transforms import (
     turned,
     type_wrapped,
     with_kinds,
-    without_wraps,
-    wrapped_edges,
 )
 from beamline.storage.writers.recon_file import opened_reconstruction
 from drivers.base.frame import FrameKind
@@ -211,14 +209,8 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
         base = Frames(base, table=lambda known: replace(known, angles=assigned))
     if views is not None:
         base = selected(base, views)
-    if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base, options)) is not None:
+    if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base)) is not None:
         base = as_unsigned(base, dtype)
-    counted = base.finished and not base.plan and base.dtype == np.uint16
-    looked = [*_some_of_each_kind(base)] if counted else []
-    flat = np.median(looked[1], axis=0) if len(looked) > 1 else None  # of darks alone it is dim
-    wraps = [wrapped_edges(images, images.dtype, flat) for images in looked]
-    if any(below for _, below in wraps) and all(below for edges, below in wraps if edges):
-        base = without_wraps(base, sum(edges for edges, _ in wraps), max(below for _, below in wraps))
     base = _with_references(base, options, side, replaced=angles is not None)
     if n > 1:
         base = AveragedSource(base, n)
@@ -288,13 +280,13 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
     return open_stacks(path, data, options.darks_path, options.flats_path, of_views)
 
 
-def _true_type(source: ScanSource, options: SourceOptions) -> np.dtype[Any] | None:
+def _true_type(source: ScanSource) -> np.dtype[Any] | None:
     """The real type of pixels that are bits of such, or the type without a sign of counts that wrapped, which holds all
     of them; None: they are what they are stored as.
     """
     if source.dtype.kind == "u":
         some = [each for each in _some_of_each_kind(source) if each.any()]
-        types = {real_type(each, options.quantity == "transmission") for each in some}
+        types = {real_type(each) for each in some}
         return types.pop() if len(types) == 1 else None
     looked_at = [(images, type_wrapped(images)) for images in _some_of_each_kind(source)]
     dtype = max((each for _, each in looked_at if each is not None), key=lambda each: each.itemsize, default=None)

@@ -182,7 +182,7 @@ def _read(path: Path, item: Any) -> NDArray[Any]:
 
 def _stack(images: NDArray[Any], name: str, untyped: bool = False) -> NDArray[Any]:
     require_real(images.dtype, name)
-    if (dtype := real_type(images, False) if untyped else type_wrapped(images)) is not None:
+    if (dtype := real_type(images) if untyped else type_wrapped(images)) is not None:
         images = unsigned(images, dtype)
     return images[None] if images.ndim == 2 else images
 

@@ -232,15 +232,14 @@ def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     return (images & np.iinfo(dtype).max).astype(dtype)
 
 
-def real_type(images: NDArray[Any], transmission: bool) -> np.dtype[Any] | None:
+def real_type(images: NDArray[Any]) -> np.dtype[Any] | None:
     """The real type of whole numbers [..., col] that are the bits of real ones; None where they are whole.
 
     Real numbers of one quantity lie close together by their bits. Whole numbers would do so only if nearly all of them
-    lay within four per cent of the range of their type, around a quarter or three quarters of it. Those of two bytes
-    all look like real ones: these must be smooth, with both signs, or be transmissions that somebody says they are.
+    lay within four per cent of the range of their type, around a quarter or three quarters of it.
     """
     size = images.dtype.itemsize
-    if images.dtype.kind != "u" or size < 2 or images.shape[-1] < 2:
+    if images.dtype.kind != "u" or size < 4 or images.shape[-1] < 2:
         return None
     dtype = np.dtype(f"{images.dtype.byteorder}f{size}")
     with np.errstate(invalid="ignore"):
@@ -248,18 +247,12 @@ def real_type(images: NDArray[Any], transmission: bool) -> np.dtype[Any] | None:
     known = np.abs(reals[np.isfinite(reals) & (reals != 0)])
     typical = float(np.median(known)) if known.size else 0.0
     near = (known > typical / _OCTAVES) & (known < typical * _OCTAVES)
-    if not (1 / _OCTAVES**2 < typical < _OCTAVES**2 and near.sum() > _NEARLY_ALL * (images != 0).sum()):
-        return None
-    if size == 2 and transmission:
-        return dtype if known.max() < _OPEN else None
-    across = (np.abs(np.diff(each, axis=-1)).mean() / each.std() for each in (reals, images.astype(np.float64)))
-    return dtype if size > 2 or (reals.min() < 0 < reals.max() and _SMOOTHER * next(across) < next(across)) else None
+    real = 1 / _OCTAVES**2 < typical < _OCTAVES**2 and near.sum() > _NEARLY_ALL * (images != 0).sum()
+    return dtype if real else None
 
 
 _OCTAVES = 2.0**20  # a quantity of an image spans less, and its median in any unit lies within its square from 1
 _NEARLY_ALL = 0.99  # of the pixels that are not 0: a few are defective
-_SMOOTHER = 3.0  # as reals than as whole numbers, in which a sign is the largest step
-_OPEN = 2.0  # beyond the transmission of any open beam
 
 
 def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
@@ -285,16 +278,14 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
     return dtype if plain < signed or (plain == signed and np.median(images) < 0) else None
 
 
-WRAPPED = "wrapped-numbers"  # a fact of a scan, and the rule on it
+WRAPPED = "wrapped-numbers"  # a rule
 _NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
-_NEARER = (10, 20, 40, 80, 160)  # parts of the range at the top, of which one holds what lies below 0, and no light
 _ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
 _SMOOTH = 3.0  # times the least change beside an edge: the step across the end, where one smooth image goes on there
 
 
-def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> tuple[int, int]:
-    """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes; and the
-    count from which on all lies below 0, as counts below a dark that was taken off them; 0: it is light.
+def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> int:
+    """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes.
 
     Two pixels on either side lie in their half of the range, which one that is hot or was hit has not. Where nearly all
     at the top have one value, light was cut off there. 0 for fewer than one in ten rows has. Where a `flat` [..., col]
@@ -302,7 +293,7 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
     it.
     """
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
-        return 0, 0
+        return 0
     counts, whole = images.astype(np.int64) - np.iinfo(dtype).min, 2**16
     top, upper = counts >= whole - whole // _NEAR, counts >= whole // 2
     ends = np.where(top, 1, -1 * (counts < whole // _NEAR))
@@ -318,36 +309,8 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
     of_low, of_high = (np.where(side, change[..., 2:], change[..., :-2])[steps] for side in (above, ~above))
     most = np.unique(counts[top], return_counts=True)[1].max(initial=0)
     if edges < _A_ROW * np.prod(images.shape[:-1]) or most > 0.9 * top.sum():
-        return 0, 0
-    if np.median(of_low) < _ALIKE * np.median(of_high):
-        return 0, 0
-    at_top = np.maximum(counts[..., 1:-2], counts[..., 2:-1])[steps]
-    flats = np.zeros((1, 2)) if flat is None else flat
-    for least in (whole - whole // part for part in _NEARER):
-        odd = int((at_top < least).sum()) + _crossings(counts, least)
-        if odd < _A_ROW * edges and np.mean(flats >= least) < 0.5 and _crossings(flats, least) < _A_ROW * len(flats):
-            return edges, least + np.iinfo(dtype).min
-    return edges, 0
-
-
-def _crossings(counts: NDArray[Any], least: int) -> int:
-    """Neighbours in a row on either side of `least` that differ by less than what is left of the range above it."""
-    over = counts >= least
-    return int(((over[..., 1:] != over[..., :-1]) & (np.abs(np.diff(counts)) < 2**16 - least)).sum())
-
-
-def without_wraps(base: ScanSource, edges: int, least: int) -> ScanSource:
-    """A scan whose counts from `least` on, which lay below a dark taken off them, are 0."""
-    fact = (
-        f"Numbers wrapped: {edges} pixels near 65535 lie beside ones near 0 in the frames looked at, as 16-bit "
-        f"whole numbers do where the dark subtracted from them was larger. Those from {least} on are taken as 0. "
-        "Subtract darks in real or signed numbers, so that the noise about 0 is kept."
-    )
-    return Frames(
-        base,
-        pixels=lambda read, frames, rows: (images := read(frames, rows)) * (images < least).astype(images.dtype),
-        attributes=lambda known: {**known, WRAPPED: fact},
-    )
+        return 0
+    return 0 if np.median(of_low) < _ALIKE * np.median(of_high) else edges
 
 
 def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None = None) -> ScanSource:

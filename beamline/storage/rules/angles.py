@@ -126,8 +126,7 @@ def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
     """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
     span = float(degrees[-1] - degrees[0])
     whole = span + span / (degrees.size - 1)
-    for unit, turn in (("radians", 2 * np.pi), ("turns", 1.0)):
-        for part, name in ((turn / 2, "half a turn"), (turn, "a turn")):
-            if n >= _FEWEST and min(abs(span / part - 1), abs(whole / part - 1)) < 0.01:
-                return f"these look like {unit}: {name} is {part:.5g}."
+    for part, name in ((np.pi, "half a turn"), (2 * np.pi, "a turn")):
+        if n >= _FEWEST and min(abs(span / part - 1), abs(whole / part - 1)) < 0.01:
+            return f"these look like radians: {name} is {part:.5g}."
     return "these look like radians or turns." if n > _MANY and span <= 2 * np.pi else None

@@ -107,9 +107,9 @@ class CoarseViews:
                 return max(float(here - (below - above) ** 2 / 8 / max(below - 2 * here + above, 1e-12)), 0.0)
         return float(curve.min())
 
-    def typical(self, pairs: Sequence[Pair], mirrored: bool = False) -> float:
+    def typical(self, pairs: Sequence[Pair]) -> float:
         """Median of `unlike`."""
-        return float(np.median([self.unlike(pair, mirrored) for pair in pairs]))
+        return float(np.median([self.unlike(pair) for pair in pairs]))
 
 
 def coarse_views(source: ScanSource) -> CoarseViews | None:
@@ -164,12 +164,13 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
 
 
 def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
-    """Views half a turn apart by their angles are mirror images (a whole turn: the same image), and no others are.
+    """Parallel views half a turn apart by their angles are mirror images, and no others are.
 
-    Parallel rays see the same from both sides, whatever the sample is, also one that is wider than the field; a cone
-    sees the same after a turn only. How much neighbours differ tells what a turn does to this sample, and what noise
-    does: a round sample shows no angle.
+    Their rays see the same from both sides, whatever the sample is, also one that is wider than the field. How much
+    neighbours differ tells what a turn does to this sample, and what noise does: a round sample shows no angle.
     """
+    if seen.source.cone is not None:
+        return
     views = seen.rows[np.argsort(seen.degrees[seen.rows], kind="stable")]
     some = _some_lit(seen, views)
     stated = seen.degrees[some]
@@ -181,11 +182,8 @@ def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
     if not chosen.size:
         return
     near = seen.typical(list(zip(some[chosen].tolist(), beside[chosen].tolist(), strict=True)))
-    for mirrored in (True, False) if seen.source.cone is None else (False,):
-        turn = _turn_seen(seen, views, some, near, mirrored)
-        if turn is not None:
-            yield _angles_finding(seen.source, seen.degrees[views], turn, mirrored)
-            return
+    if (turn := _turn_seen(seen, views, some, near)) is not None:
+        yield _angles_finding(seen.source, seen.degrees[views], turn)
 
 
 def _some_lit(seen: CoarseViews, views: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -200,60 +198,57 @@ def _nearest(seen: CoarseViews, views: NDArray[np.int64], degrees: NDArray[np.fl
 
 @dataclass(frozen=True)
 class _Turn:
-    """Two frames that look half a turn apart (or a whole turn), and two that are stated to be; None: none are."""
+    """Two frames that look half a turn apart, and two that are stated to be; None: none are."""
 
     alike: Pair
     degrees: float
     stated: Pair | None
 
 
-def _turn_seen(
-    seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int64], near: float, mirrored: bool
-) -> _Turn | None:
+def _turn_seen(seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int64], near: float) -> _Turn | None:
     """Views that repeat after another angle than they should, where those that should do not.
 
     Args:
         views, some: all, and some of them, by ascending angle.
         near: how much neighbours of these some differ.
     """
-    degrees, period = seen.degrees, (180.0 if mirrored else 360.0)
+    degrees = seen.degrees
     step = float(np.ptp(degrees[some])) / (some.size - 1)
-    partner = _nearest(seen, views, degrees[some] + period)
+    partner = _nearest(seen, views, degrees[some] + 180)
     within = min(float(np.median(np.diff(np.unique(degrees[views])))), step)
-    pairs = np.abs(degrees[partner] - degrees[some] - period) <= within
+    pairs = np.abs(degrees[partner] - degrees[some] - 180) <= within
     stated = seen.lit_pairs(some[pairs], partner[pairs])
     # The most alike of them: a crumb makes one pair unlike, wrong angles make all.
-    off = min((seen.unlike(pair, mirrored) for pair in stated), default=np.inf)
-    if off < 2 * UNLIKE * near or (not stated and not mirrored):
+    off = min((seen.unlike(pair, mirrored=True) for pair in stated), default=np.inf)
+    if off < 2 * UNLIKE * near:
         return None
     first, last, quarter = int(some[0]), int(some[-1]), some.size // 4
     ends = [(first, row) for row in some[quarter:].tolist()] + [(last, row) for row in some[1:-quarter].tolist()]
-    differences = np.array([seen.unlike(pair, mirrored) for pair in ends])
+    differences = np.array([seen.unlike(pair, mirrored=True) for pair in ends])
     usual, (end, moved) = float(np.median(differences)), ends[int(np.argmin(differences))]
     around = spread(views[(np.abs(degrees[views] - degrees[moved]) < step) & (views != end)], _AROUND).tolist()
-    best, nearest = min((seen.unlike((end, row), mirrored), row) for row in around)
-    turned, right = abs(float(degrees[nearest] - degrees[end])), max(OTHER * period, 2 * step)
+    best, nearest = min((seen.unlike((end, row), mirrored=True), row) for row in around)
+    turned, right = abs(float(degrees[nearest] - degrees[end])), max(OTHER * 180, 2 * step)
     apart = np.array([abs(degrees[second] - degrees[first]) for first, second in ends])
-    off = min([off, *differences[np.abs(apart - period) <= right]])
-    if abs(turned - period) <= right or not best < min(2 * near, off / UNLIKE, usual / UNLIKE):
+    off = min([off, *differences[np.abs(apart - 180) <= right]])
+    if abs(turned - 180) <= right or not best < min(2 * near, off / UNLIKE, usual / UNLIKE):
         return None
     return _Turn((min(end, nearest), max(end, nearest)), turned, stated[len(stated) // 2] if stated else None)
 
 
-def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Turn, mirrored: bool) -> Finding:
-    half, whole = ("half a turn", 180.0) if mirrored else ("a turn", 360.0)
-    known = [factor for factor in _FACTORS if abs(turn.degrees - whole * factor) < np.ptp(degrees) / VIEWS]
+def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Turn) -> Finding:
+    known = [factor for factor in _FACTORS if abs(turn.degrees - 180 * factor) < np.ptp(degrees) / VIEWS]
     counted = np.allclose(degrees, np.arange(degrees.size))
     if counted:
         unit = "they are 0, 1, 2 and so on, and count the views"
     else:
-        unit = f"they look {whole / turn.degrees:.3g} times as large as stated"
+        unit = f"they look {180 / turn.degrees:.3g} times as large as stated"
     pairs = (
-        f"Frames {turn.alike[0]} and {turn.alike[1]} are {'mirror images' if mirrored else 'alike'}, as views {half} "
+        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images, as views half a turn "
         f"apart are, and are stated to be {turn.degrees:.4g} degrees apart"
     )
     if turn.stated is not None:
-        pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated {whole:g} degrees apart, are not"
+        pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated 180 degrees apart, are not"
     # A plan is of our own scans, whose angles are in degrees. Without views stated half a turn apart, a sample that is
     # symmetric may look so, too; and mistakes are by one of these factors, while a sample that moves may show any.
     sure = not source.plan and turn.stated is not None and (counted or bool(known))

@@ -36,7 +36,6 @@ SPREAD = 16  # grey values between them, at least, where they are whole numbers
 WARN = 0.45  # line integral of air: the beam of Diamond 24737 lost 0.39 from its flat to its views, others 0.02
 REFUSE = 0.65  # half of the light, which goes by no drift, decay or top-up; see ReferenceLimits.light_gone
 BRIGHTER = 0.2  # line integral by which a ring that is filled again makes views brighter than their flats
-NEAR = 0.02  # share by which a factor may be off a whole number that explains it
 NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sample adds to the noise of views
 ROWS, LEAST_FLATS = 128, 3  # whose noise is looked at
 TILE, QUIET = 8, 20.0  # pixels a side, whose variance is known to a fifth; percentile of the tiles
@@ -98,7 +97,7 @@ def light_beside_flats(
             f"{where} is {factor:.3g} times as {'dark' if level > 0 else 'bright'} as the flats ({level:+.2f} of line "
             f"integral, {what}); within a scan a beam changes by up to {math.exp(WARN):.2g} times, and a sample only "
             f"takes light. Were views and references taken and stored in the same way? "
-            f"{explained(source, groups, factor)}"
+            f"{_counts_in_words(source, groups)}"
         )
         refused = abs(level) > REFUSE
         if darker:
@@ -112,7 +111,7 @@ def light_beside_flats(
             "light",
             f"Relative to their counts the flats have {ratio:.2g} times the noise of the views, though one camera has "
             f"one figure for all images, and no air shows which is right: references that were multiplied (by about "
-            f"{ratio:.2g}), or views that are means of several frames? {explained(source, groups, ratio)}",
+            f"{ratio:.2g}), or views that are means of several frames? {_counts_in_words(source, groups)}",
         )
 
 
@@ -166,20 +165,16 @@ def _change(source: ScanSource, groups: ReferenceGroups) -> float:
     return deviation_between_frames(two) if len(two) > 1 else 0.0
 
 
-def explained(source: ScanSource, groups: ReferenceGroups, factor: float) -> str:
-    """Sentences on possible causes of a factor between views and flats."""
+def _counts_in_words(source: ScanSource, groups: ReferenceGroups) -> str:
+    """Sentences on counts and exposures of flats and views, where views are brightest."""
     views = spread(source.table.views, VIEWS)
     flats = np.concatenate(groups.flats)
     seen, flat, dark = (mean_cells(source, rows) for rows in (views, flats, np.concatenate(groups.darks)))
     lit = lit_places(flat - dark)
     places = lit & (seen >= np.percentile(seen[lit], BRIGHT)) if lit.any() else np.ones_like(lit)
     counts = float(np.median(flat[places])), float(np.median(seen[places]))
-    sentences = [f"There, counts are {counts[0]:.6g} in the flats and {counts[1]:.6g} in the views."]
-    raw = max(counts) / max(min(counts), 1e-30)
-    whole = next((round(each) for each in (raw, factor) if each > 1.5 and abs(each / round(each) - 1) < NEAR), 0)
-    if whole:
-        sentences.append(f"The factor is about {whole}, as of sums of {whole} frames, or of counts shifted by bits.")
-    return " ".join([*sentences, _exposures_in_words(source, flats, views)])
+    there = f"There, counts are {counts[0]:.6g} in the flats and {counts[1]:.6g} in the views."
+    return f"{there} {_exposures_in_words(source, flats, views)}"
 
 
 def _exposures_in_words(source: ScanSource, *rows: NDArray[np.int64]) -> str:

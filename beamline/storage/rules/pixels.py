@@ -14,7 +14,7 @@ from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.readers.transforms import WRAPPED, wrapped_edges
 from beamline.storage.rules import Finding
 from drivers.base.frame import FrameKind
-from recon.base.units import look_like_counts, look_like_light, look_like_transmission, look_negative
+from recon.base.units import look_like_counts, look_like_transmission
 from recon.base.views import spread
 
 CONSTANT_DARKS = "constant-darks"  # a rule whose finding is no fault, but which `info` shows
@@ -25,26 +25,10 @@ _FALLS = (
     "The values are about 1 at the edges of the views and fall where the sample is, as transmission does; line "
     "integrals are 0 there and rise. Say --quantity transmission: its logarithm is then taken."
 )
-_DIMS = (
-    "The values are far above 1 at the edges of the views and fall where the sample is, as counts do; line integrals "
-    "are 0 there and rise. Say --quantity counts, with --darks and --flats; or divide them by the light without a "
-    "sample, and say --quantity transmission."
-)
-_NEGATIVE = (
-    "The values are 0 at the edges of the views and below 0 where the sample is, as the logarithm of transmission is; "
-    "line integrals are its negative, and rise there. Write them with the other sign."
-)
-_RISES = (
-    "The frames are divided by flats of 1, but they are 0 at the edges of the views and rise where the sample is, as "
-    "line integrals do; transmission is 1 there and falls. Say --quantity line-integrals, without --darks and --flats."
-)
 
 
 def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
     """Whole numbers stay within their type: what is brighter than its largest begins again at 0."""
-    if WRAPPED in source.attributes:
-        yield Finding("warning", WRAPPED, str(source.attributes[WRAPPED]))
-        return
     kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if source.dtype.itemsize == 2 else ()
     samples = {kind: images for kind in kinds if (images := sample(source, kind)) is not None}
     frames, flats = samples.values(), samples.get(FrameKind.FLAT)
@@ -53,7 +37,7 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
     below = _SURELY_BELOW * np.iinfo(np.int16).min if signed else -np.inf
     dark_too = FrameKind.DARK in samples and samples[FrameKind.DARK].min() < below
     low = 0 if dark_too else sum(int((images < below).sum()) for images in frames)
-    edges = sum(wrapped_edges(images, source.dtype, flat)[0] for images in frames)
+    edges = sum(wrapped_edges(images, source.dtype, flat) for images in frames)
     if not edges and low <= _FEW * sum(images.size for images in frames):
         return
     least, most = np.iinfo(source.dtype).min, np.iinfo(source.dtype).max
@@ -64,10 +48,16 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
         "error",
         WRAPPED,
         f"Numbers wrapped: in {sum(map(len, frames))} frames looked at, {what}, as 16-bit whole numbers do that went "
-        f"beyond {most} and began again at {least}, such as sums of pixels or frames. How bright these pixels were is "
-        "lost, and other references do not help. Make the frames again from those of the camera, as 32-bit or real "
-        "numbers.",
+        f"beyond {most} and began again at {least}, such as sums of pixels or frames, or below {least} where a dark "
+        "was subtracted. How bright these pixels were is lost, and other references do not help. Make the frames again "
+        "from those of the camera, as 32-bit or real numbers.",
     )
+
+
+def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
+    """Numbers are of the type that the file states."""
+    if wrapped := source.attributes.get("pixels"):
+        yield Finding("warning", "pixels", f"The label of the pixels is wrong or missing: they are {wrapped}.")
 
 
 def quantity_stated(source: ScanSource) -> Iterator[Finding]:
@@ -112,8 +102,8 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             "pixels",
             f"{1 - finite.mean():.3%} of the pixels looked at are NaN, infinite or beyond {LARGEST:g}.",
         )
-    if source.quantity == "line_integrals" and (problem := _not_line_integrals(source)):
-        yield Finding("error", "quantity", problem)
+    if source.quantity == "line_integrals" and _falls(source):
+        yield Finding("error", "quantity", f"Transmission is given as line integrals. {_FALLS}")
     elif source.quantity == "line_integrals" and look_like_counts(views):
         yield Finding(
             "warning",
@@ -121,35 +111,12 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             f"The line integrals have a median of {np.nanmedian(views):.4g}, which no light passes: are they counts? "
             "If so, say --quantity counts, with darks and flats.",
         )
-    elif source.quantity == "counts" and _rises(source):
-        yield Finding("error", "quantity", _RISES)
 
 
 def _falls(source: ScanSource) -> bool:
     """The views look like transmission, which real numbers can be."""
     views = sample(source, FrameKind.PROJECTION, SHAPES) if source.dtype.kind == "f" else None
     return views is not None and look_like_transmission(views)
-
-
-def _not_line_integrals(source: ScanSource) -> str:
-    """What the values are that are given as line integrals; "": they may be."""
-    views = sample(source, FrameKind.PROJECTION, SHAPES)
-    if views is None:
-        return ""
-    if source.dtype.kind == "f" and look_like_transmission(views):
-        return f"Transmission is given as line integrals. {_FALLS}"
-    if look_like_light(views):
-        return f"Light is given as line integrals. {_DIMS}"
-    return _NEGATIVE if look_negative(views) else ""
-
-
-def _rises(source: ScanSource) -> bool:
-    """The views look like line integrals, though they are to be divided by a beam of about 1."""
-    flats = sample(source, FrameKind.FLAT) if source.dtype.kind == "f" else None
-    if flats is None or not 0.5 < np.nanmedian(flats) < 2:
-        return False
-    views = sample(source, FrameKind.PROJECTION, SHAPES)
-    return views is not None and look_like_transmission(np.exp(-np.maximum(views, -1)))
 
 
 def sample(source: ScanSource, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:

@@ -14,7 +14,7 @@ CASES = {
     "a scan to watch": (["watch", "scan.h5"], 5, ["not written by `beamline scan`", "beamline view scan.h5"]),
     "a scan beside a volume": (["view", "scan.h5", "volume.npz"], 2, ["is a scan, which is shown alone"]),
     "a scan to export": (["export", "scan.h5", "-o", "s.tif"], 5, ["is a scan", "beamline recon scan.h5"]),
-    "a volume of Python": (["recon", "volume.npz"], 5, ["saved by Python", "beamline view"]),
+    "a volume of Python": (["recon", "volume.npz"], 5, ["no angle", "--angles FILE"]),
     "NIfTI": (["export", "volume.npz", "-o", "v.nii.gz"], 2, ["NIfTI is read, not written", ".nrrd"]),
     "half pixels": (["recon", "scan.h5", "--bin", "3.5"], 2, ["'3.5' is not a valid integer"]),
     "a sweep of one value": (["sweep", "scan.h5", "tv-weight=0.1"], 2, ["two values", "recon --tv-weight 0.1"]),

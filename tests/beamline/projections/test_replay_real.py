@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from beamline.monitor.check import Flag, Level
 from beamline.projections.replay import replay
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
-from drivers.base.frame import FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.slow_cases import others_slow
 
 DIAMOND = "diamond_24737_parallel_91x135x160.h5"
@@ -42,6 +42,10 @@ class Changed:
             if self.source.table.kinds[at] == FrameKind.PROJECTION:
                 image *= self.share(int((self.source.table.kinds[:at] == FrameKind.PROJECTION).sum()), row, col)
         return images
+
+    def frames(self, first: int = 0) -> Iterator[Frame]:
+        for row, frame in enumerate(self.source.frames(first), first):
+            yield replace(frame, counts=self.read([row])[0])
 
 
 def flags(path: Path, share: Share | None = None) -> list[Flag]:

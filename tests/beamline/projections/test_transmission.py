@@ -60,23 +60,6 @@ def test_it_is_never_taken_as_line_integrals(tmp_path: Path, beam: float) -> Non
     assert "Say --quantity transmission" in validate(SourceOptions(path, **FACTS, quantity="line_integrals"))[0].message
 
 
-@pytest.mark.parametrize(
-    ("factor", "dtype", "told"),
-    [
-        (100, np.float32, "far above 1 at the edges"),
-        (6e4, np.uint16, "far above 1 at the edges"),
-        (0, np.float32, "below 0 where the sample is"),
-    ],
-    ids=["percent", "counts", "the other sign"],
-)
-def test_light_and_the_other_sign_are_never_taken_as_line_integrals(
-    tmp_path: Path, factor: float, dtype: Any, told: str
-) -> None:
-    path = stack(tmp_path / "t.tif", factor * np.exp(-LINES) if factor else -LINES, dtype)
-    with pytest.raises(DataError, match=told):
-        lines(path, quantity="line_integrals")
-
-
 @pytest.mark.parametrize("kind", ["exchange", "nxtomo"])
 def test_files_of_other_systems_state_it_likewise(tmp_path: Path, kind: str) -> None:
     path, light = tmp_path / "t.h5", np.exp(-LINES).astype(np.float32)

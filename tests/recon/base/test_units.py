@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 from recon.base.units import (
     look_like_counts,
     look_like_degrees,
-    look_like_light,
     look_like_transmission,
-    look_negative,
 )
 
 SCANS = {
@@ -69,8 +67,6 @@ def test_transmission_is_told_from_line_integrals(radius: float, depth: float, b
     assert look_like_transmission(beam * np.exp(-lines) + jitter)
     assert not look_like_transmission(lines + jitter)
     assert not look_like_transmission(lines + jitter + 1)  # matter all around, and more in the middle
-    assert look_negative(-lines + jitter) and not look_negative(lines + jitter)
-    assert look_like_light(100 * (beam * np.exp(-lines) + jitter)) and not look_like_light(100 + lines + jitter)
 
 
 @settings(deadline=None)
@@ -82,12 +78,12 @@ def test_a_tube_seen_from_within_is_no_transmission(inner: float, wall: float, l
     profile = np.sqrt(outer**2 - u**2) - np.sqrt(np.clip(inner**2 - u**2, 0, None))
     lines = np.broadcast_to(level * profile / profile[0], (24, 8, 200))
     lines = lines + noise * np.random.default_rng(0).standard_normal(lines.shape)
-    assert not look_like_transmission(lines) and not look_negative(lines - level) and not look_like_light(20 * lines)
+    assert not look_like_transmission(lines)
 
 
 def test_noise_even_views_and_views_without_pixels_are_no_transmission(rng: np.random.Generator) -> None:
     for values in (rng.normal(0, 1, (9, 8, 64)), rng.normal(1, 0.1, (9, 8, 64)), np.ones((9, 8, 64))):
-        assert not look_like_transmission(values) and not look_negative(values) and not look_like_light(100 * values)
+        assert not look_like_transmission(values)
     assert not look_like_transmission(np.full((9, 8, 64), np.nan))
     assert not look_like_transmission(np.ones((1, 0, 64)))
 

@@ -1,4 +1,4 @@
-"""Counts of 16 bits that wrapped: beyond the largest number, and below the dark that was taken off."""
+"""Counts of 16 bits that wrapped: beyond the largest number they begin again at 0."""
 
 from __future__ import annotations
 
@@ -24,18 +24,7 @@ def counts(light: float, profile: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize(("light", "profile"), [(66_000, 0), (80_000, 0), (150_000, 0), (72_000, 0.25)])
 def test_what_is_brighter_than_the_type_begins_again(light: float, profile: float) -> None:
-    edges, below = wrapped_edges((counts(light, profile) % 2**16).astype(np.uint16), np.dtype(np.uint16))
-    assert edges > 0 and not below
-
-
-@pytest.mark.parametrize("light", [3e4, 5e4, 5.8e4, 6.2e4, 6.4e4])
-def test_what_is_below_the_dark_goes_on_at_the_end_and_is_told_from_it(light: float) -> None:
-    """Also beside air near the end, whose sharp edge is no step of the numbers."""
-    rng = np.random.default_rng(1)
-    images, flat = counts(light).astype(np.int64) - 400, np.random.default_rng(2).poisson(light, (32, 256))
-    images[:, :, 20:140] = rng.normal(0, 8, (2, 32, 120)).round()  # behind metal
-    edges, below = wrapped_edges((images % 2**16).astype(np.uint16), np.dtype(np.uint16), flat)
-    assert edges > 0 and images.max() < below < 2**16 - 40
+    assert wrapped_edges((counts(light, profile) % 2**16).astype(np.uint16), np.dtype(np.uint16))
 
 
 def test_light_that_is_cut_off_hot_pixels_and_zingers_have_not_wrapped() -> None:
@@ -48,7 +37,7 @@ def test_light_that_is_cut_off_hot_pixels_and_zingers_have_not_wrapped() -> None
     dim = counts(500)
     dim[:, ::5, ::13] = 65_000
     for some in (cut, slit, images, dim):
-        assert wrapped_edges(some.astype(np.uint16), np.dtype(np.uint16)) == (0, 0)
+        assert wrapped_edges(some.astype(np.uint16), np.dtype(np.uint16)) == 0
 
 
 @pytest.mark.parametrize("light", [62_000, 64_500])
@@ -57,7 +46,7 @@ def test_opaque_matter_with_sharp_edges_in_bright_light_has_not_wrapped(light: f
     chord = 2 * np.sqrt(np.maximum(80.0**2 - COLS**2, 0))
     draw = np.random.default_rng(3).poisson
     images, flat = draw(light * np.exp(np.broadcast_to(-0.3 * chord, (2, 32, 256)))), draw(light, (32, 256))
-    assert wrapped_edges(images.astype(np.uint16), np.dtype(np.uint16), flat) == (0, 0)
+    assert wrapped_edges(images.astype(np.uint16), np.dtype(np.uint16), flat) == 0
     bright = (counts(80_000) % 2**16).astype(np.uint16), np.dtype(np.uint16)
     assert wrapped_edges(*bright, np.full((32, 256), 80_400 % 2**16)) == wrapped_edges(*bright)
 
