@@ -16,7 +16,12 @@ from recon.base.method import Method
 from recon.base.registry import Lengths, MethodEntry, Registry, in_folders, loaded, unknown
 
 REGISTRY: dict[str, MethodEntry] = {
-    "r2": MethodEntry("recon.splatting.r2", "R2", streams=True),
+    "r2": MethodEntry(
+        "recon.splatting.r2",
+        "R2",
+        streams=True,
+        lengths=Lengths("steps", (250, 60, 125, 500), (1000, 125, 250, 500, 2000)),
+    ),
     "fbp": MethodEntry("recon.voxels.direct", "Fbp"),
     "fista-tv": MethodEntry("recon.voxels.methods", "FistaTv", lengths=Lengths("iterations", (20, 5), (20, 5, 10, 40))),
     "os-sirt-tv": MethodEntry(

@@ -72,7 +72,7 @@ for method in ("grey", recon.Grey()):
     assert (recon.reconstruct(data, views, method).volume.data == 0.5).all()
 white = methods.build(methods.by_name("grey"), {"shade": 1.0})
 assert (recon.reconstruct(data, views, white).volume.data == 1).all()
-trials = plan(("grey", "fbp"), 60, 1000, "quick")
+trials = plan(("grey", "fbp"), 60, "quick")
 labels = {t.label for t in trials if t.method == "grey"}
 assert labels == {"grey, 60 views", "grey, 30 views"}, labels
 for offered in (command, tradeoff):

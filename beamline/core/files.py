@@ -239,17 +239,6 @@ def refuse_not_utf8(path: Path | str) -> None:
         ) from error
 
 
-@contextmanager
-def named_on_failure(path: Path) -> Iterator[None]:
-    """A context that converts an OSError while writing `path` to a DataError with the path, which the system leaves
-    out.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"{path} could not be written ({error.strerror or error}). Check the disk.") from error
-
-
 def replaceable(path: Path) -> Path:
     """The file to replace or create for `path`: the target, if that is a link.
 

@@ -187,7 +187,6 @@ def run_to_end(
     command: Sequence[str],
     log: Path,
     on_line: Callable[[str], None],
-    seconds: float = math.inf,
     silence: float = math.inf,
 ) -> tuple[ProcessEnd, int | None, str]:
     """Run a command with the same imports; an exception kills it.
@@ -195,7 +194,7 @@ def run_to_end(
     Args:
         log: file for its stderr.
         on_line: receives each line of its stdout.
-        seconds, silence: real s in all, and without a line, after which it is killed.
+        silence: real s without a line, after which it is killed.
 
     Returns:
         Why it ended, its exit code, and the last line of its stderr.
@@ -207,7 +206,7 @@ def run_to_end(
         log.open("w", encoding="utf-8") as stderr,
         ChildProcess(command, stderr, on_line, with_our_path(), tether=True) as process,
     ):
-        ending = process.wait(seconds=seconds, silence=silence)
+        ending = process.wait(silence=silence)
     return ending, process.code, last_line(log)
 
 

@@ -106,21 +106,14 @@ class VolumeDone(Event, event="done"):
     record: Any = spread(lambda record: record.event_values())
 
 
-class TradeoffStarted(Event, event="tradeoff_started"):
-    """Trials begin. by: the metric that they are compared by."""
+class TrialsStarted(Event, event="trials_started"):
+    """The trials of a table, `tradeoff` or `study`, begin. by: the metric that they are compared by."""
 
     file: Path | str
+    table: str
     trials: int
-    by: str
-
-
-class StudyStarted(Event, event="study_started"):
-    """The rows of a study begin."""
-
-    file: Path | str
-    rows: int
     left_out: int
-    study: str
+    by: str
 
 
 class TrialDone(Event, event="trial"):

@@ -32,9 +32,8 @@ from beamline.core.recon_events import (
     ReconDone,
     ReconStarted,
     SnapshotWritten,
-    StudyStarted,
-    TradeoffStarted,
     TrialDone,
+    TrialsStarted,
 )
 from beamline.core.text import SENTENCE, count, one_line, size, spans
 from drivers.base.clock import Clock
@@ -59,10 +58,8 @@ def sentence(event: Event) -> str | None:
         case ReconStarted():
             again = " again, from the start" if event.again else ""
             return f"{event.method}{again}: {event.n_views} views, rotation axis at column {event.axis_col:.2f}"
-        case TradeoffStarted(file, trials, by):
+        case TrialsStarted(file, trials=trials, by=by):
             return f"{trials} trials of {file}, quality by {by}"
-        case StudyStarted(file, rows, study=study):
-            return f"{study}: {rows} reconstructions of {file}"
         case TrialDone():
             return _trial(event)
         case SnapshotWritten(path, n_views=n_views):

@@ -27,14 +27,8 @@ from beamline.storage.rules import Finding, angles_shown
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.pixels import numbers_wrapped, quantity_stated
 from beamline.storage.rules.references import references_usable
-from beamline.storage.rules.scan import (
-    SINOGRAM,
-    VARYING,
-    central_ray_taken,
-    references_present,
-    scan_ended,
-    scan_findings,
-)
+from beamline.storage.rules.scan import VARYING, central_ray_taken, references_present, scan_ended, scan_findings
+from beamline.storage.rules.stored_order import SINOGRAM
 from beamline.storage.rules.treatment import frames_flagged
 from recon.base.geometry import Geometry
 
@@ -126,6 +120,9 @@ class ViewGeometry:
         return geometry
 
 
+_OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules on what vectors of each view take the place of
+
+
 def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
     """The usable views of a finished scan, by the flags of the monitor.
 
@@ -149,7 +146,7 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
     if asked.uses_flags:
         findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
     if (poses := stated_poses(source, selection)) is not None and poses.vectors is not None:
-        findings = [finding for finding in findings if finding.rule != angles_shown.ORDER]
+        findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
     refuse(source, findings)
     usable = usable_views(source, asked.uses_flags, judged)
     if usable.sentence:

@@ -23,7 +23,7 @@ from beamline.storage.disk_file import scratch_array
 from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.assess.time_model import duration_text
-from recon.base.arrays import F32, bin_views
+from recon.base.arrays import F32
 from recon.base.decisions import Stop
 from recon.base.geometry import Geometry
 from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, candidates_of
@@ -81,30 +81,6 @@ def without_outside(prepared: PreparedProjections, made: Reconstruction) -> Prep
     if (held := prepared.held_out) is not None:
         held = held[0] - made.outside(held[1]), held[1]
     return replace(prepared, held_out=held, inside=True)
-
-
-def binned(prepared: PreparedProjections, factor: int) -> PreparedProjections:
-    """The same views with factor x factor binning: means of line integrals."""
-    if factor == 1:
-        return prepared
-    projections, counted = prepared.projections, prepared.projections.weights
-    data, weights = bin_views(projections.data, factor), None
-    if counted is not None:  # the mean of the rays that are known, each by what it says
-        weights = bin_views(counted, factor)
-        sums = bin_views(counted * projections.data, factor)
-        data = np.divide(sums, weights, out=data, where=weights > 0)
-    held, unseen, measured = prepared.held_out, prepared.held_out_weights, prepared.measured
-    if measured is not None:
-        measured = bin_views(measured[None].astype(np.float32), factor)[0] == 1
-    return replace(
-        prepared,
-        projections=replace(projections, data=data, weights=weights),
-        geometry=prepared.geometry.binned(factor),
-        measured=measured,
-        shares=None if prepared.shares is None else bin_views(prepared.shares, factor),
-        held_out=None if held is None else (bin_views(held[0], factor), held[1].binned(factor)),
-        held_out_weights=None if unseen is None else bin_views(unseen, factor),
-    )
 
 
 _AT_ONCE = 32  # views that are projected together

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
 from typing import Any, Unpack
 
@@ -441,14 +441,6 @@ def require_views(geometry: Geometry, values: ArrayLike, name: str = "projection
 
 
 def arrays_of(geometry: Geometry) -> dict[str, NDArray[Any]]:
-    """All values of a geometry as arrays, by name; `geometry_of_arrays` is the inverse."""
+    """All values of a geometry as arrays, by name."""
     values = {each.name: getattr(geometry, each.name) for each in fields(Geometry)}
     return {name: np.asarray(astuple(v) if isinstance(v, RayWidth) else v) for name, v in values.items()}
-
-
-def geometry_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> Geometry:
-    """The geometry with the values that `arrays_of` gives."""
-    values: dict[str, Any] = {name: array.item() if array.ndim == 0 else array for name, array in arrays.items()}
-    rows, cols = values.pop("detector_shape").tolist()
-    width = RayWidth(*values.pop("width").tolist())
-    return Geometry(detector_shape=(rows, cols), width=width, **values)

@@ -209,13 +209,11 @@ class Lengths:
     Attributes:
         setting: "iterations" or "steps".
         quick, full: of a short and of a long comparison. The first one is the baseline, about which others vary.
-        chosen: the data choose a length by default, which is the baseline.
     """
 
     setting: Literal["iterations", "steps"]
     quick: tuple[int, ...]
     full: tuple[int, ...]
-    chosen: bool = False
 
 
 @dataclass(frozen=True)

@@ -61,25 +61,15 @@ class BatchRow:
         return self.state in ("done", "poor")
 
 
-@dataclass(frozen=True)
-class BatchOptions:
-    """What to reconstruct, how and where.
-
-    Attributes:
-        recipe: file with the options of `beamline recon`; None: its defaults.
-        folder: of the results, new or of an earlier call with the same recipe.
-    """
-
-    scans: Sequence[Path]
-    recipe: Path | None
-    folder: Path
-
-
-def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]:
+def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Sink, clock: Clock) -> list[BatchRow]:
     """Reconstruct the scans that have no volume in the folder yet; the table is written after each.
 
     A folder of results comes into place when it is whole. A scan that fails leaves none, and the next one follows; it
     is tried again by the next call. Ctrl-C ends the scan under way, which leaves nothing; the others stay.
+
+    Args:
+        recipe: file with the options of `beamline recon`; None: its defaults.
+        folder: of the results, new or of an earlier call with the same recipe.
 
     Returns:
         All rows of the table, also those of earlier calls.
@@ -88,8 +78,8 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
         DataError: the folder is not that of a batch, or of one with another recipe; nothing was touched.
         KeyboardInterrupt: stopped; the table has the scans that were done.
     """
-    folder = options.folder
-    _begin(folder, b"" if options.recipe is None else options.recipe.read_bytes())
+    _begin(folder, b"" if recipe is None else recipe.read_bytes())
+    how = [] if recipe is None else ["--config", str(folder / RECIPE)]
     try:
         lock = WriterLock(folder / RECIPE, exclusive=True)
     except (BlockingIOError, PermissionError) as error:
@@ -98,14 +88,14 @@ def run_batch(options: BatchOptions, sink: Sink, clock: Clock) -> list[BatchRow]
             "end, or name another folder."
         ) from error
     try:
-        rows = _rows(options.scans, _read(folder))
+        rows = _rows(scans, _read(folder))
         _write(folder, rows)
         start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
         for tried, n in enumerate(waiting):
             spent = clock.now() - start
             eta, rate = seconds_left(tried, len(waiting), spent), 60 * tried / max(spent, 1e-9)
             sink(TrialReached("batch", tried, len(waiting), rows[n].scan, eta, rate, time=clock.now()))
-            row = rows[n] = _one(rows[n], options, sink, clock)
+            row = rows[n] = _one(rows[n], folder / rows[n].name, how, sink, clock)
             _write(folder, rows)
             state = row.state + (f" with {count(row.warnings, 'warning')}" if row.warnings else "")
             sentence = f"{row.name}: {state}, {row.seconds:.0f} s{', ' + row.message if row.message else ''}"
@@ -137,18 +127,12 @@ def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[st
 
 
 def _begin(folder: Path, recipe: bytes) -> None:
-    """Make the folder, or check that it belongs to this recipe."""
-    if folder.exists():
-        _refuse_other(folder, recipe)
-    else:
+    """Make the folder. Raises DataError for one that is not that of a batch by this recipe."""
+    if not folder.exists():
         with whole_file(folder) as partial:
             partial.mkdir()
             (partial / RECIPE).write_bytes(recipe)
             _write(partial, [])
-
-
-def _refuse_other(folder: Path, recipe: bytes) -> None:
-    """Raises DataError for a folder that is not that of a batch by this recipe."""
     kept = folder / RECIPE
     if not (folder / TABLE).is_file():
         raise DataError(f"{folder} exists and is no folder of a batch: it has no {TABLE}. Name another folder.")
@@ -173,8 +157,8 @@ def _rows(scans: Sequence[Path], earlier: Sequence[BatchRow]) -> list[BatchRow]:
     return [*rows, *(BatchRow(name, str(path)) for name, path in zip(names_of(new, rows), new, strict=True))]
 
 
-def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> BatchRow:
-    """Reconstruct a scan."""
+def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Clock) -> BatchRow:
+    """Reconstruct a scan into the folder `place`, with these options."""
     began, last, warned = clock.now(), dict[str, Any](), list[str]()
 
     def pass_on(line: str) -> None:
@@ -192,7 +176,6 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
             )
             sink(replace(event, scan=row.scan, **with_command))
 
-    place = options.folder / row.name
     if (place / RECON).is_file():
         return replace(
             row, state="done", seconds=0.0,
@@ -202,8 +185,7 @@ def _one(row: BatchRow, options: BatchOptions, sink: Sink, clock: Clock) -> Batc
         with whole_file(place) as work:
             work.mkdir()
             log = work / "stderr.txt"
-            recipe = [] if options.recipe is None else ["--config", str(options.folder / RECIPE)]
-            call = [*COMMAND, "recon", row.scan, *recipe, "--output", str(work / RECON), "--beside-scan", "--json"]
+            call = [*COMMAND, "recon", row.scan, *how, "--output", str(work / RECON), "--beside-scan", "--json"]
             ending, code, stderr = run_to_end(call, log, pass_on, silence=_SILENCE)
             log.unlink()
             reason = str(last.get("message", "")) or stderr.removeprefix("beamline: ")
@@ -315,10 +297,9 @@ def batch(scans: list[Path], config: Path | None, output: Path, as_json: bool) -
         from beamline.cli.recon import refuse_recipe  # here: help needs none of it
 
         refuse_recipe(config)
-    options = BatchOptions(scans, config, output)
     with answering(as_json) as answer:
         try:
-            rows = run_batch(options, answer.sink, answer.clock)
+            rows = run_batch(scans, config, output, answer.sink, answer.clock)
         except KeyboardInterrupt as stop:
             raise ScanStopped(f"The batch was stopped; {output / TABLE} says which scans are done.") from stop
         failed = [row for row in rows if not row.has_volume]

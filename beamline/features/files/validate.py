@@ -26,7 +26,8 @@ from beamline.storage.rules import Finding
 from beamline.storage.rules.light import darks_beside_views
 from beamline.storage.rules.pixels import CONSTANT_DARKS
 from beamline.storage.rules.references import VIEWS, ViewLight, reference_groups, references_usable
-from beamline.storage.rules.scan import SINOGRAM, SOURCE_RULES, altered_sentence, central_ray_taken, scan_ended
+from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, central_ray_taken, scan_ended
+from beamline.storage.rules.stored_order import SINOGRAM
 from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writer_lock import abandoned, held

@@ -33,14 +33,6 @@ from drivers.base.clock import SystemClock
 _CONFIG = "config"  # the column with the configuration's file
 
 
-@dataclass(frozen=True, eq=False)
-class QueuedScan:
-    """A scan of a queue: its sample's name, and its configuration."""
-
-    name: str
-    config: Config
-
-
 class QueueStatus(StrEnum):
     """How a scan of a queue ended."""
 
@@ -51,12 +43,8 @@ class QueueStatus(StrEnum):
     NOT_STARTED = "not started"
 
 
-@dataclass(frozen=True)
-class RecordedScan:
-    """A finished scan, or series of energies: its path, and the faults of its frames, a sentence each."""
-
-    path: Path
-    faults: tuple[str, ...] = ()
+Taken = tuple[Path, Sequence[str]]
+"""A finished scan, or series of energies: its path, and the faults of its frames, a sentence each."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +86,7 @@ def load_queue(
     *,
     rehearse: bool = False,
     no_live: Callable[[str], None] | None = None,
-) -> tuple[QueuedScan, ...]:
+) -> tuple[Config, ...]:
     """The scans of these configurations and tables, in their order.
 
     A table is a CSV file. Its first line names the column `config`, the file of a configuration (relative to the
@@ -120,11 +108,9 @@ def load_queue(
             continue
         for place, config_file, own in rows:
             try:
-                config = load(config_file, (*own, *overrides), rehearse=rehearse, no_live=no_live)
+                scans.append(load(config_file, (*own, *overrides), rehearse=rehearse, no_live=no_live))
             except ConfigError as error:
                 faults.append(f"{place}{error}")
-            else:
-                scans.append(QueuedScan(config.sample.name, config))
     if faults:
         raise ConfigError(faults[0] if len(faults) == 1 else "".join(["the queue has faults:", *_indented(faults)]))
     return tuple(scans)
@@ -158,28 +144,19 @@ def _rows(table: Path) -> Iterator[tuple[str, Path, tuple[str, ...]]]:
 
 @dataclass(frozen=True, eq=False)
 class QueueNeeds:
-    """Needs of the scans of a queue, computed without devices, by name."""
+    """Needs of the scans of a queue, computed without devices.
 
-    scans: tuple[tuple[str, DryRun], ...]
+    Attributes:
+        scans: by name.
+        duration: s for all, without changing samples.
+        total_bytes: of the files of all.
+        free_bytes: of the fullest disk.
+    """
 
-    @property
-    def duration(self) -> float:
-        """Time in s for all scans, without changing samples."""
-        return sum(map(_seconds, self._worked))
-
-    @property
-    def total_bytes(self) -> int:
-        """Bytes of the files of all scans."""
-        return sum(worked.total_bytes for worked in self._worked)
-
-    @property
-    def free_bytes(self) -> int:
-        """Free bytes of the fullest disk."""
-        return min(worked.free_bytes for worked in self._worked)
-
-    @property
-    def _worked(self) -> list[DryRun]:
-        return [worked for _, worked in self.scans]
+    scans: Sequence[tuple[str, DryRun]]
+    duration: float
+    total_bytes: int
+    free_bytes: int
 
     def lines(self) -> list[str]:
         """A line for each scan, and the sum."""
@@ -209,24 +186,26 @@ class QueueNeeds:
             raise ConfigError("".join(["Some scans of the queue cannot run; nothing was started:", *_indented(faults)]))
 
 
-def queue_needs(queue: Sequence[QueuedScan], place: Path | None) -> QueueNeeds:
+def queue_needs(queue: Sequence[Config], place: Path | None) -> QueueNeeds:
     """Compute the needs of a queue without devices; `place` as in `run_scan`.
 
     Raises:
         ConfigError: of the first scan that cannot be worked out, with its name.
     """
     scans = []
-    for waiting in queue:
+    for config in queue:
         try:
-            scans.append((waiting.name, dry_run(waiting.config, place)))
+            scans.append((config.sample.name, dry_run(config, place)))
         except ConfigError as error:
-            raise ConfigError(f"{waiting.name}: {error}") from error
-    return QueueNeeds(tuple(scans))
+            raise ConfigError(f"{config.sample.name}: {error}") from error
+    needs = [(_seconds(worked), worked.total_bytes, worked.free_bytes) for _, worked in scans]
+    seconds, sizes, free = zip(*needs, strict=True)
+    return QueueNeeds(scans, sum(seconds), sum(sizes), min(free))
 
 
 def run_queue(
-    queue: Sequence[QueuedScan],
-    take: Callable[[int, QueuedScan, StopRequest, RunNotes], RecordedScan],
+    queue: Sequence[Config],
+    take: Callable[[int, Config, StopRequest, RunNotes], Taken],
     *,
     stop_on_failure: bool = False,
 ) -> tuple[ScanOutcome, ...]:
@@ -239,25 +218,25 @@ def run_queue(
     """
     outcomes: list[ScanOutcome] = []
     ended = ""
-    for n, waiting in enumerate(queue):
+    for n, config in enumerate(queue):
+        name = config.sample.name
         if ended:
-            outcomes.append(ScanOutcome(waiting.name, QueueStatus.NOT_STARTED, None, ended, ScanStopped.exit_code))
+            outcomes.append(ScanOutcome(name, QueueStatus.NOT_STARTED, None, ended, ScanStopped.exit_code))
             continue
         stop, run = StopRequest(), RunNotes()
         try:
-            taken = take(n, waiting, stop, run)
+            path, faults = take(n, config, stop, run)
         except (Exception, KeyboardInterrupt) as error:
             asked = stop.by_person or isinstance(error, KeyboardInterrupt)
             status = QueueStatus.STOPPED if asked else QueueStatus.FAILED
-            outcomes.append(ScanOutcome(waiting.name, status, run.folder, user_message(error), exit_code(error)))
-            ended = "somebody stopped the queue" if asked else f"{waiting.name} failed" if stop_on_failure else ""
+            outcomes.append(ScanOutcome(name, status, run.folder, user_message(error), exit_code(error)))
+            ended = "somebody stopped the queue" if asked else f"{name} failed" if stop_on_failure else ""
         else:
-            status = QueueStatus.ALARMS if taken.faults else QueueStatus.COMPLETE
-            code = AlarmError.exit_code if taken.faults else 0
-            outcomes.append(ScanOutcome(waiting.name, status, taken.path, " ".join(taken.faults), code))
+            status = QueueStatus.ALARMS if faults else QueueStatus.COMPLETE
+            outcomes.append(ScanOutcome(name, status, path, " ".join(faults), AlarmError.exit_code if faults else 0))
             ended = "somebody stopped the queue" if stop.by_person else ""
         if run.unsafe:
-            ended = f"stage, camera or shutter did not obey at the end of {waiting.name}"
+            ended = f"stage, camera or shutter did not obey at the end of {name}"
     return tuple(outcomes)
 
 
@@ -315,18 +294,18 @@ def take_all(request: ScanRequest) -> None:
 
 
 def _take_next(
-    request: ScanRequest, of: int, json_sink: Sink, n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes
-) -> RecordedScan:
+    request: ScanRequest, of: int, json_sink: Sink, n: int, config: Config, stop: StopRequest, run: RunNotes
+) -> Taken:
     """Take the n-th scan of a queue of so many."""
     if request.wait and n:
-        ask_operator(f"Scan {n + 1} of {of}: bring {waiting.name} to its place.")
-    click.echo(f"Scan {n + 1} of {of}: {waiting.name}", err=True)
+        ask_operator(f"Scan {n + 1} of {of}: bring {config.sample.name} to its place.")
+    click.echo(f"Scan {n + 1} of {of}: {config.sample.name}", err=True)
     sinks: list[Sink] = [json_sink, run]
-    if waiting.config.scan.energies is not None:
-        done = take_energies(waiting.config, request, sinks, stop)
-        return RecordedScan(done.folder, tuple(fault for result in done.results for fault in faults_of(result)))
+    if config.scan.energies is not None:
+        done = take_energies(config, request, sinks, stop)
+        return done.folder, [fault for result in done.results for fault in faults_of(result)]
     with ExitStack() as held:
-        result = run_one(waiting.config, None, request, sinks, held, stop)
+        result = run_one(config, None, request, sinks, held, stop)
     if request.rehearse:
-        click.echo("\n".join(rehearsed_lines(waiting.config, result, request)), err=True)
-    return RecordedScan(result.path, tuple(faults_of(result)))
+        click.echo("\n".join(rehearsed_lines(config, result, request)), err=True)
+    return result.path, faults_of(result)

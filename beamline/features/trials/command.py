@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -13,7 +12,6 @@ import click
 
 from beamline.cli.method_options import equal_time, row_options, row_settings
 from beamline.cli.options import (
-    POSITIVE,
     MethodChoice,
     NameChoice,
     json_option,
@@ -27,7 +25,7 @@ from beamline.cli.options import (
     unknown_method,
     with_request,
 )
-from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, Grouped, heading, names_given, typed_line
+from beamline.cli.recipe import DATA, METHOD, OUTPUT, Grouped, heading, names_given, typed_line
 from beamline.cli.selection_options import chosen, selection_options
 from beamline.cli.terminal import answering
 from beamline.core.errors import ScanStopped
@@ -73,12 +71,6 @@ class TradeoffRequest:
         "--quick/--full", default=True, show_default=True, help="Effort: few and short trials, or many and long ones."
     )
     seconds: float | None = set_by(equal_time)
-    max_seconds: float | None = set_by(
-        heading(RESOURCES),
-        "--max-seconds",
-        type=POSITIVE,
-        help="Wall time of the whole command. Each method comes first once; a trial that would not fit is not begun.",
-    )
     seed: int = set_by(heading(METHOD), seed_option)
     output: Path | None = set_by(heading(OUTPUT), new_folder_option("FILE's stem + _tradeoff"))
     as_json: bool = set_by(json_option)
@@ -91,7 +83,6 @@ class TradeoffRequest:
         "quick",
         "axis",
         "seconds",
-        "max_seconds",
         "truth",
         "views",
         "rows",
@@ -109,17 +100,14 @@ def tradeoff(request: TradeoffRequest) -> None:
     Writes a folder with tradeoff.csv, pictures and an HTML page.
     Ctrl-C keeps the trials that are done (exit code 4); before the first one it writes nothing (130).
     """
-    begun = time.monotonic()  # before libraries are loaded, which takes seconds
     from beamline.features.trials.tradeoff import planned_tradeoff
 
-    scan = _compared(request, request.methods or (), f"{safe_name(request.file.stem)}_tradeoff", request.max_seconds)
+    scan = _compared(request, request.methods or (), f"{safe_name(request.file.stem)}_tradeoff")
     plan = partial(planned_tradeoff, scan, depth="quick" if request.quick else "full")
-    _compare(scan, plan, as_json=request.as_json, begun=begun)
+    _compare(scan, plan, as_json=request.as_json)
 
 
-def _compared(
-    request: TradeoffRequest | StudyRequest, methods: tuple[str, ...], folder: str, max_seconds: float | None = None
-) -> ComparedScan:
+def _compared(request: TradeoffRequest | StudyRequest, methods: tuple[str, ...], folder: str) -> ComparedScan:
     """The scan of a command, after its options were checked; `folder` is the usual one of its result."""
     from beamline.features.trials.runner import ComparedScan
 
@@ -129,18 +117,18 @@ def _compared(
     output = request.output or Path(folder)
     return ComparedScan(
         source, selection, output, methods, request.truth,
-        request.seconds, max_seconds, request.seed,
+        request.seconds, request.seed,
         typed_line(context),
     )  # fmt: skip
 
 
-def _compare(scan: ComparedScan, plan: Plan, *, as_json: bool, begun: float | None = None) -> None:
+def _compare(scan: ComparedScan, plan: Plan, *, as_json: bool) -> None:
     """Run a comparison and print its table."""
     from beamline.features.trials.runner import run_comparison
     from beamline.features.trials.table import page_of, text
 
     with answering(as_json) as answer:
-        table = run_comparison(plan, scan, answer.sink, answer.clock, begun=begun)
+        table = run_comparison(plan, scan, answer.sink, answer.clock)
         answer.lines = text(table), f"\n{'report':<10}{scan.folder / page_of(table)}"
     if table.stopped:
         counts = f"{len(table.compared)} of {len(table.todo)} trials"

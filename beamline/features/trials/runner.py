@@ -1,29 +1,23 @@
-"""Runner: reads the scan once, runs each trial in a separate process within the time limit, writes the table."""
+"""Runner: reads the scan once, runs each trial, writes the table."""
 
 from __future__ import annotations
 
-import math
-import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
 
-import numpy as np
-
+from beamline.core.durations import seconds_left
 from beamline.core.errors import DataError
-from beamline.core.events import Done, Event, Sink, TrialReached
+from beamline.core.events import Done, Sink, TrialReached
 from beamline.core.files import refuse_existing, refuse_not_utf8
 from beamline.core.machine import machine
-from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.core.recon_events import TrialDone
+from beamline.core.recon_events import TrialDone, TrialsStarted
 from beamline.core.sinks import Warn, Warnings
+from beamline.features.trials.run_trial import TrialData, run_trial
 from beamline.features.trials.table import write_page, write_table
 from beamline.features.trials.trial import HELD_OUT, Outcome, Trial, TrialTable
-from beamline.features.trials.worker import DATA, VOLUME, TrialData, TrialJob, add_references
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
@@ -38,9 +32,7 @@ from recon.base.empirical import ONE_IN
 from recon.base.volume import Grid
 from recon.methods import by_name
 
-COMMAND = (sys.executable, "-m", "beamline.features.trials.worker")
 _HELD_OUT_VIEWS = 16  # at most
-_PAGES = 5.0, 0.1  # s of the budget for pictures and page at its end; share of it, at most
 
 
 @dataclass(frozen=True)
@@ -52,8 +44,6 @@ class ComparedScan:
         methods: names in `recon.methods`; none: those that suit the comparison.
         truth: FILE or FILE:first:end to compare with.
         seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
-        max_seconds: wall time of the whole run, with reading, compiling and the page. A trial that would not fit into
-            what remains is not begun, a running one is ended. None: no limit.
         command: that repeats this, for the record.
     """
 
@@ -63,7 +53,6 @@ class ComparedScan:
     methods: Sequence[str] = ()
     truth: str | None = None
     seconds: float | None = None
-    max_seconds: float | None = None
     seed: int = 0
     command: str = ""
 
@@ -74,14 +63,12 @@ class Planned:
 
     Attributes:
         table: before any trial is done.
-        started: the event that announces it.
         references: trials whose volumes others are compared with, in addition to the truth: each with those of its
             method. Without a truth the first one has the dense and the empty regions.
     """
 
     data: TrialData
     table: TrialTable
-    started: Event
     references: tuple[Trial, ...] = ()
 
 
@@ -118,110 +105,49 @@ def opened_scan(
     return TrialData(prepared, truth), table
 
 
-def run_trial(trial: Trial, work: Path, seed: int, max_seconds: float = math.inf, *, keep: bool = False) -> Outcome:
-    """Run one trial in a separate process, which has ended when this returns or raises.
+def _run_and_show(slices: SliceSheet, seed: int, data: TrialData, trial: Trial) -> tuple[Outcome, F32 | None]:
+    """The outcome and the volume [z, y, x] of a trial; None where it failed. The page shows baselines and rows."""
+    outcome, volume = run_trial(trial, data, seed)
+    if volume is not None and trial.choice is not None:
+        slices.add(trial.label, volume, trial.choice.family, trial.method)
+    elif volume is not None and trial.group == "method":
+        slices.add(by_name(trial.method).label, volume)
+    return outcome, volume
 
-    Args:
-        work: a folder with the data, `DATA`.
-        max_seconds: after which the process is killed.
-        keep: its volume [z, y, x] is written to the file `VOLUME` of the folder.
+
+def _run_all(
+    table: TrialTable, run: Callable[[Trial], tuple[Outcome, F32 | None]], folder: Path, sink: Sink, clock: Clock
+) -> TrialTable:
+    """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
 
     Raises:
-        DataError: the disk did not take the job or the volume: trials to come would fail, too.
+        KeyboardInterrupt: before any trial was done; nothing was written.
     """
-    event = dict[str, Any]()
-
-    def on_line(line: str) -> None:
-        nonlocal event
-        event = json_object(line) or event
-
-    TrialJob(trial, seed, keep).save(work)
-    ending, code, reason = run_to_end([*COMMAND, str(work)], work / "stderr.txt", on_line, seconds=max_seconds)
-    if event.pop("event", None) == "result":
-        return Outcome(trial, "done", **event)
-    if ending is ProcessEnd.OUT_OF_TIME:
-        return Outcome(trial, "out of time", message="ended: the time given with --max-seconds was over")
-    message = event.get("message", f"its process ended with code {code}" + (f": {reason}" if reason else ""))
-    if code == DataError.exit_code:
-        raise DataError(message)
-    return Outcome(trial, "failed", message=message)
-
-
-@dataclass(frozen=True)
-class _Run:
-    """Where trials run, and how they report.
-
-    Attributes:
-        work: folder with the data.
-        end: by `now`, when the last trial must be done; inf: no limit.
-        slices: gets those that the page shows.
-    """
-
-    work: Path
-    folder: Path
-    seed: int
-    end: float
-    now: Callable[[], float]
-    emit: Callable[[Event], None]
-    slices: SliceSheet
-
-    def run(self, trial: Trial) -> tuple[Outcome, F32 | None]:
-        """The outcome within the time that remains, and the volume [z, y, x] of a trial that the page shows."""
-        path, shown = self.work / VOLUME, trial.group == "method"
-        outcome = run_trial(trial, self.work, self.seed, self.end - self.now(), keep=shown)
-        if not path.exists():
-            return outcome, None
-        volume: F32 = np.load(path)
-        path.unlink()
-        if trial.choice is None:
-            self.slices.add(by_name(trial.method).label, volume)
-        else:
-            self.slices.add(trial.label, volume, trial.choice.family, trial.method)
-        return outcome, volume
-
-    def all(self, table: TrialTable) -> TrialTable:
-        """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
-
-        Raises:
-            KeyboardInterrupt: before any trial was done; nothing was written.
-        """
-        begin, todo, walls = self.now(), table.todo, dict[str, list[float]]()
-        try:
-            for n, index in enumerate(todo):
-                trial, started, whole = table.outcomes[index].trial, self.now(), table
-                expected, left = _mean(walls.get(trial.method, [])) or 0.0, self.end - started
-                if left <= expected:
-                    refusal = f"not begun: it would take about {expected:.0f} s, and {max(left, 0.0):.0f} s were left"
-                    table = table.with_outcome(index, Outcome(trial, "not run", message=refusal))
-                    continue
-                each = _mean([wall for some in walls.values() for wall in some])
-                eta = None if each is None else min(each * (len(todo) - n), left)
-                rate = 60 * n / max(started - begin, 1e-9)
-                self.emit(TrialReached(table.name, n, len(todo), trial.label, eta, rate))
-                table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
-                outcome, _ = self.run(trial)
-                walls.setdefault(trial.method, []).append(self.now() - started)
-                table = whole.with_outcome(index, outcome)
-                if table.compared:
-                    write_table(self.folder, table)
-                self.emit(_event_of(table, n + 1, len(todo), outcome))
-        except KeyboardInterrupt:
-            if not table.compared:
-                raise
-            table = replace(table, stopped=True)
-        write_table(self.folder, table)
-        return table
-
-
-def _mean(seconds: Sequence[float]) -> float | None:
-    return sum(seconds) / len(seconds) if seconds else None
+    begin, todo = clock.now(), table.todo
+    try:
+        for n, index in enumerate(todo):
+            trial, whole, spent = table.outcomes[index].trial, table, clock.now() - begin
+            eta, rate = seconds_left(n, len(todo), spent), 60 * n / max(spent, 1e-9)
+            sink(TrialReached(table.name, n, len(todo), trial.label, eta, rate, time=clock.now()))
+            table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
+            outcome, _ = run(trial)
+            table = whole.with_outcome(index, outcome)
+            if table.compared:
+                write_table(folder, table)
+            sink(replace(_event_of(table, n + 1, len(todo), outcome), time=clock.now()))
+    except KeyboardInterrupt:
+        if not table.compared:
+            raise
+        table = replace(table, stopped=True)
+    write_table(folder, table)
+    return table
 
 
 def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone:
     """A trial that has ended, the n-th of so many; `gaussians` are those at its start, as in its settings."""
     trial = outcome.trial
     figures = {
-        **{name: getattr(trial, name) for name in ("group", "method", "views", "binning")},
+        **{name: getattr(trial, name) for name in ("group", "method", "views")},
         **trial.settings,
         "cpu_seconds": outcome.cpu_seconds,
         "gaussians_end": outcome.gaussians,
@@ -233,81 +159,56 @@ def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone
     )
 
 
-def run_comparison(
-    plan: Plan,
-    scan: ComparedScan,
-    sink: Sink,
-    clock: Clock,
-    now: Callable[[], float] = time.monotonic,
-    begun: float | None = None,
-) -> TrialTable:
+def run_comparison(plan: Plan, scan: ComparedScan, sink: Sink, clock: Clock) -> TrialTable:
     """Run all trials and write table, pictures and page into the folder. The event `done` names the folder.
 
     The table is written after every trial, so that an interruption loses at most one. After Ctrl-C the table is
-    `stopped`. A folder without results is removed. The views lie in a file of the folder while the trials run: this
-    process does not keep them.
+    `stopped`. A folder without results is removed.
 
     Args:
         plan: reads the scan and says which trials to run.
-        begun: by `now`, when the time of the run began; None: it begins here.
 
     Raises:
         ConfigError, DataError: nothing was written, or the table of the trials that were done.
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
-    started, end = clock.now(), math.inf
-    if (limit := scan.max_seconds) is not None:
-        end = (now() if begun is None else begun) + limit - min(_PAGES[0], _PAGES[1] * limit)
-
-    def emit(event: Event) -> None:
-        sink(replace(event, time=clock.now()))
-
-    planned, slices = plan(Warnings(sink, clock)), SliceSheet()
-    emit(planned.started)
-    data, table, references = planned.data, planned.table, planned.references
-    with _result_folder(scan.folder) as work:
-        run = _Run(work, scan.folder, scan.seed, end, now, emit, slices)
-        data.save(work / DATA)
-        if references:
-            _add_references(work / DATA, data.truth, references, run)
+    started, slices = clock.now(), SliceSheet()
+    planned, run = plan(Warnings(sink, clock)), partial(_run_and_show, slices, scan.seed)
+    table, todo = planned.table, len(planned.table.todo)
+    left_out = len(table.outcomes) - todo
+    sink(TrialsStarted(scan.source.path, table.name, todo, left_out, table.by, time=clock.now()))
+    scan.folder.mkdir()
+    try:
+        data = _with_references(planned.data, planned.references, partial(run, planned.data), scan.seed)
         if data.truth is not None:
             slices.add("truth", data.truth)
-        del planned, data
-        table = run.all(table)
+        table = _run_all(table, partial(run, data), scan.folder, sink, clock)
+    finally:
+        with suppress(OSError):  # it has results; without any the next run would refuse it
+            scan.folder.rmdir()
     write_page(scan.folder, table, slices)
-    summary = {"output": scan.folder, "trials": len(table.todo), "done": len(table.compared), "stopped": table.stopped}
-    emit(Done({**summary, "seconds": clock.now() - started}))
+    summary = {"output": scan.folder, "trials": todo, "done": len(table.compared), "stopped": table.stopped}
+    sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
     return table
 
 
-def _add_references(folder: Path, truth: F32 | None, references: Sequence[Trial], run: _Run) -> None:
-    """Add the volumes of these trials to the data, and the dense and empty regions of the truth or of the first one.
+def _with_references(
+    data: TrialData, references: Sequence[Trial], run: Callable[[Trial], tuple[Outcome, F32 | None]], seed: int
+) -> TrialData:
+    """The data with the volumes of these trials, and the dense and empty regions of the truth or of the first one.
 
     Raises:
         DataError: a reference could not be made.
     """
+    if not references:
+        return data
     volumes, regions = dict[str, F32](), None
     for reference in references:
-        outcome, volume = run.run(reference)
+        outcome, volume = run(reference)
         if volume is None:
             raise DataError(f"{reference.label}, to compare with, failed: {outcome.message}. Nothing was written.")
         volumes[reference.method] = volume
-    contrast = next(iter(volumes.values())) if truth is None else truth
+    contrast = next(iter(volumes.values())) if data.truth is None else data.truth
     with suppress(ValueError):  # it has no dense and empty regions
-        regions = metrics.kmeans_mask(metrics.sampled(contrast), run.seed)
-    add_references(folder, volumes, regions)
-
-
-@contextmanager
-def _result_folder(folder: Path) -> Iterator[Path]:
-    """Make the folder of a result, and a temporary folder in it, which is removed at the end of the block.
-
-    An empty result folder is removed, too, because the next run would refuse it.
-    """
-    folder.mkdir()
-    try:
-        with TemporaryDirectory(dir=folder, ignore_cleanup_errors=True) as work:
-            yield Path(work)
-    finally:
-        with suppress(OSError):  # it has results
-            folder.rmdir()
+        regions = metrics.kmeans_mask(metrics.sampled(contrast), seed)
+    return replace(data, references=volumes, regions=regions)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from beamline.core.text import count
 from beamline.features.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
 from recon.methods import build, by_name, has_setting
 
-Status = Literal["done", "failed", "out of time", "interrupted", "not run"]
+Status = Literal["done", "failed", "interrupted", "not run"]
 
 LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
 _ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
@@ -29,7 +28,6 @@ class Trial:
         group: what it varies: "method" where nothing.
         method: its name in `recon.methods`.
         views: how many, spread evenly over those of the scan, or as many as `choice` has.
-        binning: of detector pixels, on top of the selection's.
         settings: of the method, by name as `recon.methods.build` takes them.
         seconds_asked: after which the reconstruction ends; None: when its work is done.
         choice: which views; None: `views` of them, evenly spread.
@@ -38,7 +36,6 @@ class Trial:
     group: str
     method: str
     views: int
-    binning: int = 1
     settings: Mapping[str, Plain] = field(default_factory=dict, hash=False)
     seconds_asked: float | None = None
     choice: ViewChoice | None = None
@@ -77,9 +74,8 @@ class Trial:
         if self.choice is not None:
             return f"{self.choice.label}: {self.method}"
         parts = [self.method, f"{self.views} views"]
-        parts += [f"bin {self.binning}"] if self.binning > 1 else []
         parts += [f"{self.seconds_asked:g} s"] if self.seconds_asked is not None else []
-        return ", ".join([*parts, *(_in_words(name, value) for name, value in self.settings.items())])
+        return ", ".join([*parts, *(f"{value} {name}" for name, value in self.settings.items())])
 
 
 def _ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
@@ -88,20 +84,6 @@ def _ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
         return {}
     lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
     return {name: value for name, value in lengths.items() if has_setting(method, name)}
-
-
-_WORDS: Mapping[str, Callable[[Any], str]] = {
-    "steps": lambda n: f"{n} steps",
-    "gaussians": lambda n: f"{n / 1000:.3g}k Gaussians" if isinstance(n, int) and n >= 1000 else f"{n} Gaussians",
-    "iterations": lambda n: count(n, "iteration"),
-    "fit.loss": lambda name: f"{name} loss",
-    "fit.ssim_weight": lambda weight: f"ssim_weight {weight}" if weight else "no SSIM",
-    "fit.kernel": lambda name: f"{name} kernel",
-}
-
-
-def _in_words(name: str, value: Plain) -> str:
-    return _WORDS[name](value) if name in _WORDS else f"{name.rsplit('.', 1)[-1]} {value}"
 
 
 HELD_OUT = "residual_held_out"
@@ -219,7 +201,7 @@ class TrialTable:
         every = [each.trial for each in self.outcomes]
         values: dict[str, Any] = {
             "row": trial.label if trial.choice is None else trial.choice.label,
-            **{name: getattr(trial, name) for name in ("group", "method", "views", "binning", "frames")},
+            **{name: getattr(trial, name) for name in ("group", "method", "views", "frames")},
             "window": 1 if trial.choice is None else trial.choice.window,
             **{name: trial.settings.get(name) for each in every for name in each.settings},
             "status": outcome.status,

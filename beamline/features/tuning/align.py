@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,34 +20,17 @@ from beamline.instrument.connect import ConnectedDevices
 from beamline.plan.plan import Block, Mode
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import F64
-from recon.prep.align import AxisError, axis_from_pair, mirror_mismatch
+from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, mirror_mismatch
 from recon.prep.axis_wedge import FEWEST_BANDS
-from recon.prep.tilt import line_through
+from recon.prep.tilt import TiltEstimate, line_through
 
 BANDS = 12  # Bands of rows, at most; none has fewer than FEWEST_ROWS
 FEWEST_ROWS = 8
 ROUNDS = 3
 
 
-@dataclass(frozen=True)
-class PairAlignment:
-    """Position and tilt of the rotation axis.
-
-    Attributes:
-        axis_col: its column at the middle row, 0 at the centre of the first column.
-        tilt: rad; the axis' column grows by tan(tilt) a row. NaN: the bands do not tell it.
-        uncertainty: rad, one standard deviation of the tilt.
-        confident: the views match well, and their halves agree.
-    """
-
-    axis_col: float
-    tilt: float
-    uncertainty: float
-    confident: bool
-
-
-def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> PairAlignment:
-    """Find the axis from two views half a turn apart.
+def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> tuple[AxisEstimate, TiltEstimate | None]:
+    """The axis from two views half a turn apart, and its tilt; None where bands of rows do not tell it.
 
     Args:
         p0, p180: float [row, col], line integrals.
@@ -72,8 +55,8 @@ def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> PairAlig
             break
         tilt += found.tilt
     if found is None:
-        return PairAlignment(axis_from_pair(p0, p180).value, math.nan, math.nan, whole.confident)
-    return PairAlignment(whole.value, tilt, found.uncertainty, whole.confident)
+        return replace(axis_from_pair(p0, p180), confident=whole.confident), None
+    return whole, replace(found, tilt=tilt)
 
 
 def finest_structure(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
@@ -194,21 +177,21 @@ def evaluate(frames: Sequence[Frame], pixel_size: float) -> Alignment:
     integrals = [-np.log(np.maximum(frame.counts - dark, 1.0) / light) for frame in views]
     one, other = (np.mean(integrals[i : i + TWICE], axis=0) for i in (0, TWICE))
     try:
-        pair = align_pair(one, other)
+        axis, tilt = align_pair(one, other)
     except AxisError as error:
         raise QualityError(f"The two views show no axis: {error}") from error
-    if not pair.confident:
+    if not axis.confident:
         raise QualityError(
-            f"The two views do not match: the axis may be near column {pair.axis_col:.1f}, or not. Take a sample with "
+            f"The two views do not match: the axis may be near column {axis.value:.1f}, or not. Take a sample with "
             "more contrast that stays in the field of view, and look at the flats."
         )
-    offset = pair.axis_col - (dark.shape[1] - 1) / 2
+    offset = axis.value - (dark.shape[1] - 1) / 2
     return Alignment(
-        axis_col=pair.axis_col,
+        axis_col=axis.value,
         offset=offset,
         offset_mm=offset * pixel_size,
-        tilt=pair.tilt,
-        uncertainty=pair.uncertainty,
+        tilt=math.nan if tilt is None else tilt.tilt,
+        uncertainty=math.nan if tilt is None else tilt.uncertainty,
         detail=finest_structure(integrals[0], integrals[1]),
         angle=views[0].angle,
         rows=dark.shape[0],

@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import click
 
@@ -19,16 +19,12 @@ from beamline.core.stop import StopRequest, stop_signals
 
 if TYPE_CHECKING:
     from beamline.config.load import Config
+    from beamline.features.tuning.align import Alignment
+    from beamline.features.tuning.tune import Tuning
     from beamline.instrument.connect import ConnectedDevices
 
 
-class Evaluated(Protocol):
-    """What frames say."""
-
-    def lines(self) -> list[str]: ...
-
-
-Found = TypeVar("Found", bound=Evaluated)
+Found = TypeVar("Found", bound="Tuning | Alignment")
 
 
 @click.command()

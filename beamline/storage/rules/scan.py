@@ -25,9 +25,9 @@ from beamline.storage.rules.pixels import (
     pixels_measured,
     quantity_stated,
 )
+from beamline.storage.rules.stored_order import axis_vertical, sinogram_told, views_first
 from drivers.base.frame import FrameKind
 
-SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and `recon` show
 VARYING = "lengths"  # a rule on those that differ from view to view
 _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
 
@@ -89,23 +89,6 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
                 f"Counts without {name}: give --{name} FILE (or a folder). If the frames were divided by their flats, "
                 f"say --quantity transmission, or line-integrals where their logarithm was taken.{way}",
             )
-
-
-def sinogram_told(source: ScanSource) -> Iterator[Finding]:
-    """Tell what is taken for the views of an array [view, col], and how to state another order."""
-    axes = str(source.attributes.get("dimensions", "")).split(",")
-    if sorted(axes) == ["col", "frame"]:
-        n = source.table.views.size
-        first = axes[0] == "frame"
-        option = f"give --order {'col,view' if first else 'view,col'}"
-        if source.format == "data_exchange":
-            option = f"set the attribute axes of /exchange/data to {'x:theta' if first else 'theta:x'}"
-        yield Finding(
-            "info",
-            SINOGRAM,
-            f"The array has two dimensions: it is taken as one sinogram of {n} views and {source.shape[1]} columns. "
-            f"If they are the other way round, {option}.",
-        )
 
 
 def series_complete(source: ScanSource) -> Iterator[Finding]:
@@ -202,6 +185,8 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     pixels_measured,
     pixels_as_labelled,
     views_scaled,
+    axis_vertical,
+    views_first,
     sinogram_told,
     series_complete,
     scale_known,

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path) -> None:
     """The same volume and the same views: one figure, and one label."""
-    sweep, worker = pytest.importorskip(SWEEP), pytest.importorskip("beamline.features.trials.worker")
+    sweep, trials = pytest.importorskip(SWEEP), pytest.importorskip("beamline.features.trials.run_trial")
     source = ArraySource(SCAN.line_integrals().astype(np.float32), [0] * len(SCAN.angles), SCAN.angles)
     source.quantity = "line_integrals"
     prepared = prepare_projections(source, Selection(views="every:3", axis_col=20.7), lambda _: None)
@@ -42,7 +42,7 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     )
     scores = sweep.scores_of([one])
     assert scores is not None
-    by_tradeoff, _ = worker.measured("fbp", volume.data, worker.TrialData(prepared, None), grid)
+    by_tradeoff, _ = trials.measured("fbp", volume.data, trials.TrialData(prepared, None), grid)
     assert scores.shares[0] == pytest.approx(by_recon, rel=1e-5)
     assert by_tradeoff["residual_held_out"] == pytest.approx(by_recon, rel=1e-5)
     swept = beamline("sweep", "scan.h5", "filter=ram-lak,hann", "--axis", "20.7")

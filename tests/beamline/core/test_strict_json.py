@@ -18,7 +18,6 @@ from recon.base.volume import Grid, Volume
 
 ROOT = Path(recon.__file__).parents[1]
 EXACT = {
-    "beamline/features/trials/worker.py": "the line of a process to its parent, which takes infinities back",
     "beamline/storage/writers/partial_volume.py": "what a resumed reconstruction takes back to the bit",
 }
 """Where NaN and infinities are written, for this program alone."""

@@ -15,7 +15,6 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import hold_out
 from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
-from beamline.reconstruct.run import binned
 from recon.base.choices import Noise
 from recon.prep.counts import Counts, line_integrals
 from tests.beamline.array_source import ArraySource, scan_of
@@ -100,14 +99,9 @@ def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
     apart = np.setdiff1d(np.arange(len(EXACT)), held.projections.view_ids - prepared.projections.view_ids[0])
     both = np.concatenate((np.delete(weights, apart, 0), weights[apart]))
     np.testing.assert_allclose(alike / alike.mean(), both / both.mean(), rtol=1e-5)
-    bins = binned(held, 2)
-    assert bins.held_out_weights is not None and bins.held_out is not None
-    assert bins.held_out_weights.shape == bins.held_out[0].shape
     rows = held.of_rows(slice(2, 6), held.geometry.rows(2, 6)).held_out_weights
     assert rows is not None and held.held_out_weights is not None
     np.testing.assert_array_equal(rows, held.held_out_weights[:, 2:6])
-    coarse = binned(prepared, 2).projections
-    assert coarse.weights is not None and coarse.weights.shape == coarse.data.shape == (len(EXACT), 8, 32)
 
 
 def test_one_flat_does_not_tell_the_gain() -> None:

@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from beamline.core.events import Event
-from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.reconstruct.budget import in_budget
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.reconstruct.run import binned
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
@@ -26,7 +24,6 @@ from recon.base.volume import Grid
 from recon.forecast import Forecast, Timing
 from recon.splatting.r2 import R2
 from recon.voxels.direct import Fbp
-from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.clock import SteppedClock
 
@@ -95,21 +92,6 @@ def test_a_run_in_a_budget_is_that_of_the_methods_left(tmp_path: Path) -> None:
     assert same.parameters["budget"] == 1000 and "16.7 min for fbp or fista-tv or" in chosen
     assert short.method == "fbp" and "r2 would take about" in too_few
     assert any("0.001 s are too short for this scan" in str(event.data) for event in events)
-
-
-@pytest.fixture(scope="module")
-def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedProjections:
-    path = write_exchange(tmp_path_factory.mktemp("prepared") / "scan.h5", SCAN)
-    return prepare(path, Selection(views="fixed:24", axis_col=SCAN.axis_col))[0]
-
-
-def test_binned_views_keep_their_scale_and_place(prepared: PreparedProjections) -> None:
-    assert binned(prepared, 1) is prepared
-    half = binned(prepared, 2)
-    assert half.geometry.pixel_pitch == 2 * prepared.geometry.pixel_pitch
-    assert half.projections.data.shape == (24, 3, 20)
-    assert half.projections.data.mean() == pytest.approx(prepared.projections.data.mean(), rel=1e-5)
-    assert half.held_out is not None and half.held_out[0].shape[1:] == (3, 20)
 
 
 @pytest.mark.slow

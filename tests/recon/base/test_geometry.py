@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple, fields
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.base.geometry import Geometry, arrays_of, geometry_of_arrays
+from recon.base.geometry import Geometry, arrays_of
 from recon.base.ray_width import NO_WIDTH, RayWidth
 from recon.splatting.problem import binned_geometry
 from tests.recon.trigonometry import pixel_of
@@ -92,10 +93,11 @@ def test_arrays_hold_all_of_a_geometry() -> None:
         one.seen_with(RayWidth(1.0, 0.5, 0.01)),
         Geometry.parallel([1.0], (3, 3)).seen_with(NO_WIDTH, 1e-4),
     ):
-        found = geometry_of_arrays(arrays_of(geometry))
-        for name, value in arrays_of(found).items():
-            np.testing.assert_array_equal(value, arrays_of(geometry)[name])
-        assert found.width == geometry.width and all(array.dtype != object for array in arrays_of(found).values())
+        found = arrays_of(geometry)
+        assert found.keys() == {each.name for each in fields(Geometry)}
+        assert all(array.dtype != object for array in found.values())
+        np.testing.assert_array_equal(found["width"], astuple(geometry.width))
+        np.testing.assert_array_equal(found["angles"], geometry.angles)
 
 
 def test_a_fan_is_a_cone_of_one_row_in_the_plane_of_the_source() -> None:

@@ -18,7 +18,7 @@ from beamline.core.events import Event, Failed, StateEntered, Warned
 from beamline.core.process import ProcessEnd
 from beamline.core.text import csv_text, safe_name
 from beamline.features.batch import command as batch
-from beamline.features.batch.command import COMMAND, BatchOptions, BatchRow, names_of, run_batch
+from beamline.features.batch.command import COMMAND, BatchRow, names_of, run_batch
 from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
@@ -132,7 +132,7 @@ def test_a_row_has_what_its_reconstruction_warned_of_and_whose_the_options_are(
 
     monkeypatch.setattr(batch, "run_to_end", run)
     passed_on: list[Event] = []
-    (row,) = run_batch(BatchOptions([Path("scan.h5")], None, Path("out")), passed_on.append, SystemClock())
+    (row,) = run_batch([Path("scan.h5")], None, Path("out"), passed_on.append, SystemClock())
     assert (row.warnings, row.message[: len(said)]) == (warnings, said)
     assert ("`beamline recon" in row.message) == ("Give these options" in said)
     assert _table(Path("out"))["scan"]["warnings"] == str(warnings)
@@ -174,7 +174,7 @@ def test_a_scan_whose_process_crashes_or_hangs_or_leaves_no_volume_fails_with_th
 ) -> None:
     monkeypatch.setattr(batch, "COMMAND", (sys.executable, "-c", program))
     monkeypatch.setattr(batch, "_SILENCE", 1.5)
-    (row,) = run_batch(BatchOptions([Path("scan.h5")], None, Path("out")), lambda _: None, SystemClock())
+    (row,) = run_batch([Path("scan.h5")], None, Path("out"), lambda _: None, SystemClock())
     assert row.state == "failed" and reason in row.message
     assert left(folder / "out") == {"batch.csv", "recipe.yaml"}
 
@@ -182,7 +182,7 @@ def test_a_scan_whose_process_crashes_or_hangs_or_leaves_no_volume_fails_with_th
 @pytest.mark.slow
 def test_in_a_process_of_its_own_a_volume_beyond_the_limit_of_the_residual_is_kept_and_named(folder: Path) -> None:
     Path("recipe.yaml").write_text("method: fbp\nmax-residual: 1e-6\n")
-    (row,) = run_batch(BatchOptions([Path("scan.h5")], Path("recipe.yaml"), Path("out")), lambda _: None, SystemClock())
+    (row,) = run_batch([Path("scan.h5")], Path("recipe.yaml"), Path("out"), lambda _: None, SystemClock())
     assert row.state == "poor"
     assert "--max-residual" in row.message
     assert Path("out/scan/recon.h5").is_file()

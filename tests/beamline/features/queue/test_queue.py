@@ -6,16 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from beamline.config.load import config_folder
+from beamline.config.load import Config, config_folder
 from beamline.core.errors import AlarmError, ConfigError, DataError, ScanStopped
 from beamline.core.events import RunStarted, StateEntered
 from beamline.core.stop import StopRequest
 from beamline.features.queue.scans import (
-    QueuedScan,
     QueueError,
     QueueStatus,
-    RecordedScan,
     RunNotes,
+    Taken,
     load_queue,
     queue_needs,
     raise_unless_complete,
@@ -28,9 +27,8 @@ SIMULATED = config_folder() / "simulated.yaml"
 
 
 @pytest.fixture(scope="module")
-def queue() -> tuple[QueuedScan, ...]:
-    config = load_queue([SIMULATED], ())[0].config
-    return tuple(QueuedScan(name, config) for name in ("one", "two", "three"))
+def queue() -> tuple[Config, ...]:
+    return tuple(load_queue([SIMULATED], [f"sample.name={name}"])[0] for name in ("one", "two", "three"))
 
 
 def table(folder: Path, *lines: str) -> Path:
@@ -43,8 +41,13 @@ def test_a_table_has_a_scan_a_line_and_empty_cells_change_nothing(tmp_path: Path
     (tmp_path / "own.yaml").write_text(SIMULATED.read_text("utf-8"), encoding="utf-8")
     lines = "config, sample.name,scan.exposure_s", "own.yaml,a,", "", f"{SIMULATED},b,0.02"
     scans = load_queue([table(tmp_path, *lines), SIMULATED], ["scan.angles.views=60"])
-    assert [(scan.name, scan.config.scan.exposure_s) for scan in scans] == [("a", 0.05), ("b", 0.02), ("battery", 0.05)]
-    assert {scan.config.scan.angles.views for scan in scans} == {60}  # type: ignore[union-attr]
+    named = [(config.sample.name, config.scan.exposure_s) for config in scans]
+    assert named == [
+        ("a", 0.05),
+        ("b", 0.02),
+        ("battery", 0.05),
+    ]
+    assert {config.scan.angles.views for config in scans} == {60}  # type: ignore[union-attr]
     needs = queue_needs(scans, tmp_path)
     worked = [each.timeline for _, each in needs.scans]
     assert needs.duration == pytest.approx(sum(each.duration for each in worked))
@@ -71,13 +74,13 @@ def test_a_wrong_table_is_refused_with_its_lines(tmp_path: Path, lines: tuple[st
         load_queue([table(tmp_path, *lines)], ())
 
 
-def test_a_failure_does_not_keep_the_next_from_its_turn(queue: tuple[QueuedScan, ...], tmp_path: Path) -> None:
-    def take(n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes) -> RecordedScan:
-        run(RunStarted(tmp_path / waiting.name, tmp_path, waiting.name, 1, 1.0, 1, ()))
+def test_a_failure_does_not_keep_the_next_from_its_turn(queue: tuple[Config, ...], tmp_path: Path) -> None:
+    def take(n: int, waiting: Config, stop: StopRequest, run: RunNotes) -> Taken:
+        run(RunStarted(tmp_path / waiting.sample.name, tmp_path, waiting.sample.name, 1, 1.0, 1, ()))
         if n == 1:
             stop.stop("the monitor asked", by_itself=True)
             raise DataError("frames are missing")
-        return RecordedScan(tmp_path / f"{n}.h5", ("2 frames have an alarm.",) * (n == 2))
+        return tmp_path / f"{n}.h5", ("2 frames have an alarm.",) * (n == 2)
 
     outcomes = run_queue(queue, take)
     assert [outcome.status for outcome in outcomes] == [QueueStatus.COMPLETE, QueueStatus.FAILED, QueueStatus.ALARMS]
@@ -94,12 +97,12 @@ def test_a_failure_does_not_keep_the_next_from_its_turn(queue: tuple[QueuedScan,
 
 @pytest.mark.parametrize("how", ["stop", "interrupt", "stop while a volume is made", "unsafe"])
 def test_nothing_begins_after_a_stop_or_with_an_instrument_that_did_not_obey(
-    queue: tuple[QueuedScan, ...], how: str
+    queue: tuple[Config, ...], how: str
 ) -> None:
     begun = []
 
-    def take(n: int, waiting: QueuedScan, stop: StopRequest, run: RunNotes) -> RecordedScan:
-        begun.append(waiting.name)
+    def take(n: int, waiting: Config, stop: StopRequest, run: RunNotes) -> Taken:
+        begun.append(waiting.sample.name)
         if how == "interrupt":
             raise KeyboardInterrupt
         if how == "unsafe":
@@ -108,7 +111,7 @@ def test_nothing_begins_after_a_stop_or_with_an_instrument_that_did_not_obey(
         stop.stop()
         if how == "stop":
             raise ScanStopped("Stopped after 3 of 9 projections")
-        return RecordedScan(Path("s.h5"))
+        return Path("s.h5"), ()
 
     outcomes = run_queue(queue, take)
     assert begun == ["one"] and {outcome.status for outcome in outcomes[1:]} == {QueueStatus.NOT_STARTED}

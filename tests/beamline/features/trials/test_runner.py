@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import errno
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -17,20 +16,17 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.core.events import Event
-from beamline.core.machine import STATUS, peak_memory
-from beamline.features.trials import runner, tradeoff
-from beamline.features.trials.runner import ComparedScan, opened_scan, run_comparison, run_trial
+from beamline.features.trials import runner
+from beamline.features.trials.runner import ComparedScan, run_comparison
 from beamline.features.trials.table import text
 from beamline.features.trials.tradeoff import planned_tradeoff
 from beamline.features.trials.trial import Outcome, Trial, TrialTable
-from beamline.features.trials.worker import DATA, VOLUME, TrialData, write_array
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from tests.beamline.cli.small_scan import left
-from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders, write_exchange
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
@@ -44,24 +40,20 @@ def _options(tmp_path: Path, **changes: Any) -> ComparedScan:
     return replace(scan, **{"methods": ("r2", "fbp"), "command": "beamline tradeoff scan.h5", **changes})
 
 
-def run_tradeoff(
-    scan: ComparedScan, sink: Callable[[Event], None] = lambda e: None, *how: Any, **more: Any
-) -> TrialTable:
-    return run_comparison(partial(planned_tradeoff, scan), scan, sink, SystemClock(), *how, **more)
+def run_tradeoff(scan: ComparedScan, sink: Callable[[Event], None] = lambda e: None) -> TrialTable:
+    return run_comparison(partial(planned_tradeoff, scan), scan, sink, SystemClock())
 
 
-def _made_up(trial: Trial, work: Path | None = None, *_: object, keep: bool = False) -> Outcome:
+def _made_up(trial: Trial, *_: object) -> tuple[Outcome, Any]:
     """A trial that takes no time: more work gives more quality, for more seconds and memory."""
-    if keep and work is not None:
-        write_array(work / VOLUME, np.zeros((4, 40, 40), np.float32))
-    amount = float(int(trial.settings.get("steps") or 20) * trial.views / trial.binning)
+    amount = float(int(trial.settings.get("steps") or 20) * trial.views)
     metrics = {"residual_held_out": 1 / amount, "psnr": math.log(amount)}
-    return Outcome(trial, "done", amount / 1000, int(1e6 * amount), metrics)
+    return Outcome(trial, "done", amount / 1000, int(1e6 * amount), metrics), np.zeros((4, 40, 40), np.float32)
 
 
 @pytest.fixture
-def made_up(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., Outcome]], None]:
-    def use(trial: Callable[..., Outcome]) -> None:
+def made_up(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., Any]], None]:
+    def use(trial: Callable[..., Any]) -> None:
         monkeypatch.setattr(runner, "run_trial", trial)
 
     use(_made_up)
@@ -86,7 +78,7 @@ def test_all_that_is_promised_is_in_the_folder(tmp_path: Path, made_up: object) 
     assert page.count("data:image/png;base64,") == 2
     assert all(outcome.trial.label in page for outcome in table.compared)
     names = [event.event for event in events if event.event != "progress"]
-    assert names == ["tradeoff_started", *["trial"] * len(rows), "done"]
+    assert names == ["trials_started", *["trial"] * len(rows), "done"]
     said, first = next(e.data for e in events if e.event == "trial"), table.outcomes[0].trial
     assert {name: said[name] for name in first.settings} == first.settings and said["views"] == first.views
 
@@ -101,7 +93,7 @@ def test_with_a_truth_no_view_is_held_out(tmp_path: Path, made_up: object) -> No
 def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any, done: int) -> None:
     begun: list[Trial] = []
 
-    def interrupted(trial: Trial, *_: object, keep: bool = False) -> Outcome:
+    def interrupted(trial: Trial, *_: object) -> Any:
         begun.append(trial)
         if len(begun) > done:
             raise KeyboardInterrupt
@@ -117,89 +109,28 @@ def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any, done
     assert table.stopped and len(table.compared) == 3
     rows = _rows(tmp_path / "out")
     assert [row["status"] for row in rows] == ["done"] * 3 + ["interrupted"] + ["not run"] * (len(rows) - 4)
-    assert left(tmp_path / "out") == FILES
+    assert left(tmp_path / "out") == FILES | {"slices.png"}
 
 
 def _full(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")  # as a write reports it: without a name
 
 
-@pytest.mark.parametrize(("where", "name"), [((np, "save"), r"data/.*\.npy"), ((Path, "write_bytes"), "tradeoff.csv")])
 def test_a_full_disk_names_the_file_and_is_not_in_the_way_of_the_next_try(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_up: object, where: tuple[object, str], name: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made_up: object
 ) -> None:
     options = _options(tmp_path)
     with monkeypatch.context() as full:
-        full.setattr(*where, _full)
-        with pytest.raises(DataError, match=rf"{name} could"):
+        full.setattr(Path, "write_bytes", _full)
+        with pytest.raises(DataError, match=r"tradeoff\.csv could"):
             run_tradeoff(options)
     assert left(tmp_path) == {"scan.h5"}
     assert run_tradeoff(options).compared
 
 
-def test_a_limit_of_time_bounds_reading_and_the_page(
-    tmp_path: Path, made_up: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """On a clock on which reading takes 20 s and each trial 5 s."""
-    at = 100.0
-
-    def read(*args: Any, **more: Any) -> Any:
-        nonlocal at
-        at += 20
-        return opened(*args, **more)
-
-    def trial(one: Trial, work: Path, seed: int, remaining: float, *, keep: bool) -> Outcome:
-        nonlocal at
-        at += min(5, remaining)
-        return _made_up(one) if remaining >= 5 else Outcome(one, "out of time")
-
-    opened = opened_scan
-    monkeypatch.setattr(tradeoff, "opened_scan", read)
-    made_up(trial)
-    table = run_tradeoff(_options(tmp_path, max_seconds=60.0), lambda e: None, lambda: at, begun=95.0)
-    assert at <= 150  # 60 s from 95 on, less five for the page
-    done = [outcome.trial for outcome in table.compared]
-    assert [each.method for each in done[:2]] == ["fbp", "r2"]  # each method once, the direct one first
-    refused = [outcome.message for outcome in table.outcomes if outcome.status == "not run"]
-    assert len(refused) == len(table.outcomes) - len(done)
-    assert all("not begun: it would take about 5 s" in message for message in refused)
-
-
 def test_a_trial_that_fails_is_a_line_of_the_table(tmp_path: Path, made_up: Any) -> None:
-    made_up(lambda trial, *_, **__: Outcome(trial, "failed", message="no room"))
+    made_up(lambda trial, *_: (Outcome(trial, "failed", message="no room"), None))
     table = run_tradeoff(_options(tmp_path))
     assert "failed: no room" in text(table) and "No trial has both" in text(table)
     assert "failed: no room" in (tmp_path / "out" / "tradeoff.html").read_text(encoding="utf-8")
     assert left(tmp_path / "out") == {"tradeoff.csv", "tradeoff.html"}
-
-
-@pytest.mark.parametrize(
-    ("program", "limit", "status", "said"),
-    [
-        ("import time; time.sleep(60)", 0.5, "out of time", "--max-seconds"),
-        ("import sys; sys.exit('it broke')", math.inf, "failed", "it broke"),
-        ('print(\'{"event": "failed", "message": "no matter"}\')', math.inf, "failed", "no matter"),
-        ('print(\'words\'); print(\'{"event": "result", "seconds": 2.5}\')', 60.0, "done", ""),
-    ],
-)
-def test_what_becomes_of_a_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, limit: float, status: str, said: str
-) -> None:
-    monkeypatch.setattr(runner, "COMMAND", [sys.executable, "-c", program])
-    outcome = run_trial(Trial("method", "fbp", 10), tmp_path, 0, limit)
-    assert (outcome.status, said in outcome.message) == (status, True)
-    assert (outcome.seconds == 2.5) is (status == "done")
-
-
-@pytest.mark.slow
-def test_a_real_trial_in_a_real_process(tmp_path: Path) -> None:
-    """Its memory is its own: this process, which has more, does not show in it."""
-    views = Geometry.parallel(SCAN.angles, SCAN.shape)
-    prepared = prepared_views(SCAN.line_integrals().astype(np.float32), views)
-    TrialData(prepared, SCAN.truth(Grid.matching(views))).save(tmp_path / DATA)
-    ballast = np.ones(90_000_000)  # 720 MB
-    outcome = run_trial(Trial("method", "fbp", 30), tmp_path, 0, 120)
-    assert outcome.status == "done", outcome.message
-    assert outcome.quality("psnr") > 20
-    assert (outcome.peak_bytes is None) != STATUS.is_file()  # Linux
-    assert outcome.peak_bytes is None or 5e7 < outcome.peak_bytes < ballast.nbytes < (peak_memory() or 0)

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from beamline.features.trials import runner
+from beamline.features.trials.run_trial import TrialData, averaged, measured
 from beamline.features.trials.trial import Outcome, Trial
-from beamline.features.trials.worker import DATA, VOLUME, TrialData, averaged, measured, write_array
 from recon.base.volume import Grid
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.html_page import parsed_page
@@ -29,15 +30,13 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, TrialData]]:
     """Rows are off the truth by ERROR everywhere; the FBP of all views is the truth."""
     found: list[tuple[Trial, TrialData]] = []
 
-    def trial(trial: Trial, work: Path, seed: int, limit: float, *, keep: bool) -> Outcome:
-        data = TrialData.load(work / DATA)
+    def trial(trial: Trial, data: TrialData, seed: int) -> tuple[Outcome, NDArray[np.float32]]:
         grid = Grid.matching(data.geometry)
         volume = SCAN.truth(grid) + np.float32(ERROR if found else 0)
-        write_array(work / VOLUME, volume)
         figures, _ = measured(trial.method, volume, data, grid)
         assert trial.choice is not None
         found.append((trial, replace(data, prepared=averaged(data.prepared, trial.choice))))
-        return Outcome(trial, "done", 2.0, 10**8, figures, cpu_seconds=1.0)
+        return Outcome(trial, "done", 2.0, 10**8, figures, cpu_seconds=1.0), volume
 
     monkeypatch.setattr(runner, "run_trial", trial)
     return found
@@ -113,19 +112,19 @@ def test_windows_reach_the_method_as_means_of_light(folder: Path, seen: list[Any
     np.testing.assert_allclose(mean.prepared.projections.data, -np.log(light), atol=1e-5)
     np.testing.assert_allclose(np.degrees(mean.geometry.angles), np.arange(180) + 0.25, atol=1e-6)
     events = [json.loads(line) for line in result.stdout.splitlines()]
-    assert (events[0]["event"], events[-1]["event"], events[-1]["done"]) == ("study_started", "done", len(rows))
+    assert (events[0]["event"], events[-1]["event"], events[-1]["done"]) == ("trials_started", "done", len(rows))
 
 
 def test_ctrl_c_leaves_the_rows_done_and_says_so(
     folder: Path, seen: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_exchange(folder / "many.h5", SCAN)
-    trial = runner.run_trial
+    trial = vars(runner)["run_trial"]
 
-    def interrupted(*arguments: Any, **named: Any) -> Outcome:
+    def interrupted(*arguments: Any) -> Any:
         if len(seen) == 3:
             signal.raise_signal(signal.SIGINT)
-        return trial(*arguments, **named)
+        return trial(*arguments)
 
     monkeypatch.setattr(runner, "run_trial", interrupted)
     result = beamline("study", "random", "many.h5", "--axis", "20.7", "-m", "fbp", "--draws", "2", "-o", "out")

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beamline.features.trials.run_trial import averaged
 from beamline.features.trials.view_choices import STUDIES, ViewChoice, ViewSet
-from beamline.features.trials.worker import averaged
 from recon.base.geometry import Geometry
 from tests.beamline.prepared_views import prepared_views
 

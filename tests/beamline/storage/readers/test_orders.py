@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from beamline.features.files.validate import describe, validate
 from beamline.projections.selection import Selection
 from beamline.projections.views import checked_views
 from beamline.storage.readers.open import SourceOptions, open_scan
-from beamline.storage.rules.scan import SINOGRAM
+from beamline.storage.rules.stored_order import SINOGRAM
 
 VIEWS = np.arange(5 * 3 * 4, dtype=np.float32).reshape(5, 3, 4)
 NAMES = ("view", "row", "col")
@@ -208,24 +207,3 @@ def test_a_damaged_chunk_of_a_zarr_is_named(tmp_path: Path) -> None:
         np.testing.assert_array_equal(source.read([1, 3]), VIEWS[[1, 3]])
         with pytest.raises(DataError, match=r"Frame 2 of / in .* cannot be read"):
             source.read([2])
-
-
-@pytest.mark.parametrize("quantity", ["counts", "line_integrals"])
-def test_a_scan_with_a_horizontal_axis_is_turned_upright(tmp_path: Path, quantity: str) -> None:
-    path, rng = tmp_path / "s.h5", np.random.default_rng(0)
-    frames = rng.integers(100, 20000, (24, 20, 40)).astype(np.uint16 if quantity == "counts" else np.float32)
-    turned = np.rot90(frames, k=-1, axes=(1, 2))
-    with h5py.File(path, "w") as file:
-        file["exchange/data"], file["exchange/theta"] = turned, np.linspace(0, 180, 24, endpoint=False)
-        if quantity == "counts":
-            file["exchange/data_dark"] = np.full((2, 40, 20), 100, np.uint16)
-            file["exchange/data_white"] = np.full((2, 40, 20), 20100, np.uint16)
-    upright = SourceOptions(path, quantity=quantity, horizontal_axis=True)  # type: ignore[arg-type]
-    with open_scan(upright) as source:
-        views = np.flatnonzero(source.table.kinds == 0)
-        assert source.shape == (20, 40)
-        np.testing.assert_array_equal(source.read(views, slice(3, 9)), frames[:, 3:9])
-        if quantity == "counts":
-            np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], frames[-1])
-    with open_scan(replace(upright, cols=(5, 30))) as source:
-        np.testing.assert_array_equal(source.read(views[:2], slice(2, 4)), frames[:2, 2:4, 5:30])

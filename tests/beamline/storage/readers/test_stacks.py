@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.stored_order import axis_vertical
 
 PATHS: dict[str, Any] = {
     "data_path": "/raw/images",
@@ -153,3 +155,27 @@ def test_dimensions_that_shapes_tell(
     with open_scan(_options(_stored(tmp_path / "s.mat", images, ORDERS[dimensions], matlab, one))) as source:
         np.testing.assert_array_equal(source.read(slice(5 - 3 * one, None)), images[5:])
         np.testing.assert_array_equal(source.read([0])[0], images[0])
+
+
+@pytest.mark.parametrize("store", ["stacks", "exchange"])
+def test_the_advice_for_exchanged_rows_and_columns_gives_no_mirror_image(tmp_path: Path, store: str) -> None:
+    angles, place = np.arange(60) * 3.0, np.arange(24) - 11.5
+    t = np.radians(angles)[:, None, None]
+    shadow = np.exp(-((place - 5 * np.cos(t)) ** 2 + (place[:, None] - 3) ** 2) / 8)
+    views = np.round(4e4 * np.exp(-shadow)).astype(np.uint16)
+    names = {"stacks": ("proj", "dark", "flat"), "exchange": ("data", "data_dark", "data_white")}[store]
+    with h5py.File(tmp_path / "s.h5", "w") as file:
+        group = file if store == "stacks" else file.create_group("exchange")
+        stacks = views, np.zeros((2, 24, 24), "u2"), np.full((2, 24, 24), 40_000, "u2")
+        for name, part in zip(names, stacks, strict=True):
+            group[name] = part.transpose(0, 2, 1)
+        group["theta"] = angles
+        group["theta"].attrs["units"] = "deg"
+    given: dict[str, Any] = {"darks_path": "dark", "flats_path": "flat", "angles_path": "theta", "data_path": "proj"}
+    with open_scan(SourceOptions(tmp_path / "s.h5", **(given if store == "stacks" else {}))) as source:
+        (finding,) = axis_vertical(source)
+    options = dict(re.findall(r"--(\w+)-path ([\w/,:]+\w)", finding.message))
+    given |= {f"{name}_path": where for name, where in options.items()}
+    with open_scan(SourceOptions(tmp_path / "s.h5", **given)) as source:
+        np.testing.assert_array_equal(source.read(slice(4, None)), views)
+        assert not [*axis_vertical(source)]

@@ -1,0 +1,158 @@
+"""Rules on the order in which frames are stored: dimensions of a stack, direction of the axis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules import Finding
+from beamline.storage.rules.pixels import SHAPES
+from recon.base.views import spread
+from recon.prep.unmeasured import with_borders_filled
+
+_TURNED = 12  # views by which the direction of the axis is found
+_LEAST = 8  # views, rows and columns: fewer tell nothing of it
+_LEAST_SQUARE = 16  # views and rows, as many
+_ON_A_SINE, _OFF_A_SINE, _OTHER_MASS = 0.9, 4.0, 4.0  # share of a change; times what is left of it; times a variance
+_HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
+
+
+def axis_vertical(source: ScanSource) -> Iterator[Finding]:
+    """The rotation axis is parallel to the columns: each detector row then shows the same matter in every view."""
+    views = source.table.views_with_angles
+    if source.table.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
+        return
+    depths = _depths(source, spread(views, _TURNED))
+    if not depths.size:
+        return
+    ratio = change_of_rows(depths)
+    if ratio > _HORIZONTAL:
+        yield Finding(
+            "warning",
+            "axis",
+            f"From view to view the matter in a row changes {ratio:.3g} times as much as the matter in a column, as if "
+            f"the rotation axis were horizontal; it is expected along the columns. {_exchanged(source)}If it is "
+            "horizontal, say --horizontal-axis.",
+        )
+
+
+_EXCHANGE = (("angle", "theta"), ("dark", "data_dark"), ("flat", "data_white"))
+
+
+def _exchanged(source: ScanSource) -> str:
+    """How rows and columns of stacks in HDF5 are exchanged, as a sentence; "" for other formats.
+
+    MATLAB writes dimensions in reverse. A quarter turn would show the mirror image of these.
+    """
+    data, dimensions = source.attributes.get("data"), str(source.attributes.get("dimensions", "frame,row,col"))
+    others = ""
+    if source.format == "data_exchange":
+        data, others = "exchange/data", "".join(f" --{name}s-path exchange/{at}" for name, at in _EXCHANGE)
+    order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
+    say = f"If rows and columns are exchanged, as MATLAB writes them, say --data-path {data}:{order}{others}. "
+    return "" if data is None else say
+
+
+def change_of_rows(depths: NDArray[np.float64]) -> float:
+    """Squared change of the row sums of [view, row, col] from view to view, relative to that of the column sums.
+
+    About 1 where there is noise alone. Rotation about the columns moves matter along the rows, whose sums stay as they
+    are. What a drifting beam does to rows is in their ends, too, and so is matter that leaves a narrow field, from each
+    row in proportion to what is in it: a parabola over the rows and their mean profile, fitted to the ends, are taken
+    off.
+    """
+    change = depths - depths.mean(axis=0)
+    ends = max(1, depths.shape[2] // 16)
+    beside = np.median(np.concatenate([change[..., :ends], change[..., -ends:]], axis=2), axis=2)
+    parabola = np.polynomial.legendre.legvander(np.linspace(-1, 1, depths.shape[1]), 2)
+    profiles = np.column_stack([parabola, depths.mean(axis=(0, 2))])
+    change = change - (beside @ np.linalg.pinv(profiles, rcond=1e-6).T @ profiles.T)[..., None]
+    of_rows, of_cols = (float(change.sum(axis=axis).var(axis=0).sum()) for axis in (2, 1))
+    rounding = 1e-20 * float((np.abs(depths).sum(axis=2) ** 2).sum())
+    return of_rows / max(of_cols, rounding) if of_rows > rounding else 0.0
+
+
+def views_first(source: ScanSource) -> Iterator[Finding]:
+    """If there are as many views as rows, the first dimension is that of the views, and the second that of the rows.
+
+    In sinograms it is the other way round: of each image the rows are views, so that they have one mass, and the first
+    moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do not.
+    """
+    views = source.table.views
+    angles = source.table.angles[views]
+    if source.table.shifts is not None or not views.size == source.shape[0] >= _LEAST_SQUARE:
+        return
+    some = np.arange(views.size)[:: -(-views.size // SHAPES)]
+    depths = _depths(source, views[some]) if np.isfinite(angles).all() and source.shape[1] >= _LEAST else np.zeros(0)
+    if len(depths) != some.size:
+        return
+    ends = max(1, depths.shape[2] // 16)
+    depths = depths - np.median(np.concatenate([depths[..., :ends], depths[..., -ends:]], axis=2), axis=2)[..., None]
+    mass, first = depths.sum(axis=2), depths @ (np.arange(depths.shape[2]) - (depths.shape[2] - 1) / 2)
+    rows = len(mass[0])
+    along_rows = _explained(first.T, np.array([part.mean() for part in np.array_split(angles, rows)]))
+    along_frames = _explained(first, angles[some])
+    if mass.var(axis=0).sum() / len(mass[0]) > _OTHER_MASS * mass.var(axis=1).sum() / len(mass) and (
+        along_rows > _ON_A_SINE and 1 - along_frames > _OFF_A_SINE * (1 - along_rows)
+    ):
+        yield Finding(
+            "warning",
+            "axis",
+            f"The {views.size} images look like sinograms: the rows of each hold one mass, whose centre goes along a "
+            f"sine of the angles ({along_rows:.0%} of its change), as views do, and from image to image it does not "
+            f"({along_frames:.0%}). Then the first dimension counts rows of the detector: --order row,view,col, or "
+            "in a file the attribute axes of the dataset (y:theta:x), says so.",
+        )
+
+
+SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and `recon` show
+
+
+def sinogram_told(source: ScanSource) -> Iterator[Finding]:
+    """Tell what is taken for the views of an array [view, col], and how to state another order."""
+    axes = str(source.attributes.get("dimensions", "")).split(",")
+    if sorted(axes) == ["col", "frame"]:
+        n = source.table.views.size
+        first = axes[0] == "frame"
+        option = f"give --order {'col,view' if first else 'view,col'}"
+        if source.format == "data_exchange":
+            option = f"set the attribute axes of /exchange/data to {'x:theta' if first else 'theta:x'}"
+        yield Finding(
+            "info",
+            SINOGRAM,
+            f"The array has two dimensions: it is taken as one sinogram of {n} views and {source.shape[1]} columns. "
+            f"If they are the other way round, {option}.",
+        )
+
+
+def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> float:
+    """Share of the change of values [view, of each] that is a sine of the angles [view]."""
+    parts = np.column_stack([np.ones_like(angles), np.cos(angles), np.sin(angles)])
+    rest = values - parts @ np.linalg.lstsq(parts, values, rcond=None)[0]
+    change = float(values.var(axis=0).sum())
+    return 1 - float((rest**2).mean(axis=0).sum()) / change if change > 0 else 0.0
+
+
+def _depths(source: ScanSource, views: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Line integrals of some views [view, row, col], coarse, but for what all views share."""
+    block = max(1, min(max(source.shape) // 128, min(source.shape) // _LEAST))
+    rows, cols = (n // block for n in source.shape)
+    darks = source.table.darks[:1]
+    dark = read_known(source, darks)[0].astype(np.float64) if darks.size and source.quantity == "counts" else 0.0
+    bits = []
+    for view in views.tolist():
+        image = read_known(source, [view])[0].astype(np.float64)
+        if view in source.unreadable or not np.isfinite(image).all():
+            continue
+        image = image if source.quantity == "line_integrals" else with_borders_filled(image) - dark
+        coarse = image[: rows * block, : cols * block].reshape(rows, block, cols, block).mean(axis=(1, 3))
+        bits.append(coarse)
+    depths = np.array(bits).reshape(-1, rows, cols)
+    if source.quantity == "line_integrals" or not len(depths):
+        return depths
+    if not depths.max() > 0:  # neither counts nor transmission
+        return depths[:0]
+    return -np.log(np.maximum(depths, 1e-3 * np.max(depths)))

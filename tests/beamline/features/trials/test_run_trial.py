@@ -1,0 +1,129 @@
+"""One trial: the figures are those of the volume it made."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from beamline.core.machine import STATUS, peak_memory
+from beamline.features.trials import run_trial as module
+from beamline.features.trials.run_trial import TrialData, run_trial
+from beamline.features.trials.trial import Outcome, Trial
+from beamline.projections.prepared import with_views_held_out
+from recon.assess.metrics import psnr
+from recon.base.geometry import Geometry
+from recon.base.volume import Grid, Volume
+from recon.methods import by_name, names_of_one_volume
+from recon.voxels.fbp import fbp
+from recon.voxels.projector import project
+from recon.voxels.resolution import ViewResolution, at_voxel_resolution
+from tests.beamline.prepared_views import prepared_views
+from tests.beamline.scans import TwoCylinders
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(4, 40))
+
+
+@pytest.fixture
+def data() -> TrialData:
+    views = Geometry.parallel(SCAN.angles, SCAN.shape, pixel_pitch=0.5, axis_col=SCAN.axis_col)
+    integrals = SCAN.line_integrals().astype(np.float32)
+    held = np.arange(3, 30, 9)
+    half = TwoCylinders(SCAN.angles, SCAN.shape, SCAN.axis_col, 0.5)
+    prepared = with_views_held_out(prepared_views(integrals, views), held)
+    return TrialData(prepared, half.truth(Grid.matching(views)))
+
+
+def run(trial: Trial, data: TrialData, seed: int, *clocks: Any) -> Outcome:
+    return run_trial(trial, data, seed, *clocks)[0]
+
+
+@pytest.mark.parametrize("method", ["fbp", "fista-tv", "sirt"])
+def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str) -> None:
+    """Whatever stands for them in the views that are used, and in those held out."""
+    assert data.prepared.held_out is not None
+    measured = np.ones((4, 40), np.bool_)
+    measured[:, :5] = False
+    figures = []
+    for filled in (0.0, 3.0):
+        used, (held, unseen) = data.prepared.projections.data.copy(), data.prepared.held_out
+        used[:, :, :5] = filled
+        views = replace(data.prepared.projections, data=used)
+        held = np.where(measured, held, np.float32(filled))
+        given = replace(data.prepared, projections=views, held_out=(held, unseen), measured=measured)
+        trial = Trial("method", method, data.geometry.n_views)
+        found = run(trial, replace(data, prepared=given), 0)
+        figures.append([*found.metrics.values(), *found.squared_residuals])
+    np.testing.assert_array_equal(figures[0], figures[1])
+    blind = run(trial, replace(data, prepared=replace(given, measured=None)), 0)
+    assert blind.metrics["residual_held_out"] > 1.2 * found.metrics["residual_held_out"]
+
+
+def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> None:
+    found = run(Trial("method", "fbp", data.geometry.n_views), data, 0)
+    expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
+    assert data.truth is not None and data.prepared.held_out is not None
+    assert found.metrics["psnr"] == pytest.approx(psnr(data.truth, expected))
+    volume = Volume(expected, Grid.matching(data.geometry))
+    unseen, geometry = data.prepared.held_out
+    resolution = ViewResolution.of(geometry, volume.grid)
+    seen = at_voxel_resolution(np.ascontiguousarray(unseen.swapaxes(1, 2)), resolution).swapaxes(1, 2)
+    left = np.linalg.norm(project(volume, geometry) - seen) / np.linalg.norm(unseen)
+    assert found.metrics["residual_held_out"] == pytest.approx(left, rel=1e-6)
+    assert found.gaussians is None
+    if STATUS.is_file():  # Linux: this process has its libraries and these arrays, and never had more than now
+        assert found.peak_bytes is not None and 1e8 < found.peak_bytes <= (peak_memory() or 0)
+
+
+def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> None:
+    """Spoiling them changes its residual and nothing else."""
+    trial = Trial("method", "r2", 27, settings={"steps": 100, "gaussians": 150})
+    assert data.prepared.held_out is not None
+    unseen, geometry = data.prepared.held_out
+    spoilt = replace(data, prepared=replace(data.prepared, held_out=(2 * unseen, geometry)))
+    kept, other = (run(trial, d, 0).metrics for d in (data, spoilt))
+    assert kept["psnr"] == other["psnr"] and kept["residual_held_out"] < other["residual_held_out"]
+
+
+@pytest.mark.parametrize(
+    "method",
+    [name for name in names_of_one_volume() if not by_name(name).traits.direct],
+)
+def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) -> None:
+    """On a clock that goes on by a tenth of a second whenever it is asked."""
+    ticks = itertools.count()
+    trial = Trial("method", method, 27, seconds_asked=8.0)
+    alone = replace(data, prepared=replace(data.prepared, held_out=None))
+    found = run(trial, alone, 0, lambda: 0.1 * next(ticks))
+    own_length = by_name(method).traits.own_length
+    assert (0 if own_length else 0.6 * 8) < found.seconds < 1.1 * 8
+    assert np.isfinite(found.metrics["psnr"])
+
+
+@pytest.mark.parametrize(
+    ("error", "said"), [(ValueError("no matter"), "no matter"), (MemoryError("3 GB"), "Out of memory (3 GB)")]
+)
+def test_a_method_that_refuses_or_lacks_memory_is_an_outcome(
+    data: TrialData, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str
+) -> None:
+    def refuse(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(module, "run_on", refuse)
+    outcome, volume = run_trial(Trial("method", "fbp", 27), data, 0)
+    assert (outcome.status, volume) == ("failed", None) and said in outcome.message
+
+
+def test_the_memory_of_a_trial_is_its_own_and_not_that_of_earlier_ones(data: TrialData) -> None:
+    if not STATUS.is_file():
+        pytest.skip("only Linux counts the peak anew")
+    ballast = np.ones(90_000_000)  # 720 MB
+    del ballast
+    peak = run(Trial("method", "fbp", 27), data, 0).peak_bytes
+    assert peak is not None and peak < psutil.Process().memory_info().rss + 3e8
