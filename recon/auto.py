@@ -17,7 +17,7 @@ from recon.base.volume import Grid
 from recon.methods import CANDIDATES, by_name
 from recon.voxels.choice import LEAST_GAIN, Choice
 from recon.voxels.held_out import LEAST_VIEWS
-from recon.voxels.iterative import TrialWatch, Watch, entered, threads_for
+from recon.voxels.iterative import TrialWatch, Watch, scaled_problem, threads_for
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial, TrialSettings
 
@@ -114,7 +114,7 @@ def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates
     watch = Watch(on_trial=TrialWatch(told, problem.geometry.n_views, sweeps))
     given = problem.views.masked()
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
-    scan, _ = entered(projector, given.data, given.weights, None, True, watch, decide)
+    scan, _ = scaled_problem(projector, given.data, given.weights, None, True, watch, decide)
     return Trial.of(scan, TrialSettings(problem.wide, all_rows, control.now))
 
 

@@ -26,7 +26,7 @@ from recon.voxels.matter_checks import (
     unexplained_memory,
 )
 from recon.voxels.odd_views import OddView, odd_views, odd_views_memory
-from recon.voxels.residuals import SquaresLeft, volume_left
+from recon.voxels.residuals import SquaresLeft, left_by_volume
 
 _VIEWS = 16  # of those used, whose residual is stated
 _ODD_VIEWS_WORK = 1.5  # projections of all rays
@@ -37,15 +37,15 @@ class Aspect(Flag):
     """What a volume is judged by, beside a truth.
 
     RESIDUAL: what it leaves of up to 16 views used, and of all views held out. STRAY: mass where views show nothing.
-    FIT, with the residual: what a volume fitted to the views hides or has not explained. That is a uniform one beside
-    it, structure left in the views, views that do not fit.
+    FIT, with RESIDUAL: of a volume fitted to its views, what it hides or leaves unexplained: whether a uniform volume
+    does as well, structure left in the views, and views that do not fit.
     """
 
     RESIDUAL, STRAY, FIT = auto(), auto(), auto()
 
 
 class TimeLeft(NamedTuple):
-    """Whether there is time for so many seconds, by a clock."""
+    """A clock, and whether so many more seconds may be taken."""
 
     now: Clock = lambda: 0.0
     leaves: Callable[[float], bool] = lambda seconds: True
@@ -59,7 +59,7 @@ class Judgement:
         figures: of merit, by name: psnr, ssim3d, nrmse by a truth; residual, residual_held_out, unexplained, stray by
             views.
         held_out: what the volume leaves of each view held out; None where there is none.
-        along_rows: what the volume and a uniform one leave, as of `volume_left`; None: not compared.
+        along_rows: what the volume and a uniform one leave, as of `left_by_volume`; None: not compared.
         unexplained: structure that the volume leaves in the views; None where that is not known.
         stray: mass where views show nothing; None where it was not looked for.
         odd_views: with a part that the volume does not explain.
@@ -103,10 +103,10 @@ def judge(
     odd, skipped, fitted = tuple[OddView, ...](), list[str](), Aspect.FIT in aspects
     if Aspect.RESIDUAL in aspects:
         begun = time.now()
-        left, along_rows = volume_left(volume, views, _VIEWS, progress, beside_uniform=fitted)
+        left, along_rows = left_by_volume(volume, views, _VIEWS, progress, beside_uniform=fitted)
         figures["residual"], projected = left.residual, left.rays.sum() * (3 if fitted else 1)
         if held_out is not None:
-            unseen, _ = volume_left(volume, held_out, held_out.geometry.n_views, progress)
+            unseen, _ = left_by_volume(volume, held_out, held_out.geometry.n_views, progress)
             figures["residual_held_out"], projected = unseen.residual, projected + unseen.rays.sum()
         seconds = (time.now() - begun) * views.data.size / float(projected)
     if fitted and (structure := unexplained(volume, views, np.random.default_rng(seed))) is not None:

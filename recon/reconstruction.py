@@ -14,8 +14,15 @@ from recon.base.arrays import some_values, without_mask
 from recon.base.declared_types import Natural, check_arguments
 from recon.base.geometry import Geometry, require_views, unseen_axis
 from recon.base.masks import RayWeights
-from recon.base.method import DataUse, Method, ReconProblem, RunControl, candidates_of, setting
-from recon.base.method import Reconstruction as Reconstruction
+from recon.base.method import (
+    DataUse,
+    Method,
+    ReconProblem,
+    Reconstruction,
+    RunControl,
+    candidates_of,
+    setting,
+)
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.view_data import Views
 from recon.base.volume import Grid

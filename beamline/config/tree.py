@@ -112,7 +112,7 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
     problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
     if isinstance(error, yaml.reader.ReaderError):
         at = error.position
-        return text.count("\n", 0, at) + 1, f"the character U+{ord(text[at]):04X} belongs to no text; take it out"
+        return text.count("\n", 0, at) + 1, f"the character U+{ord(text[at]):04X} is not allowed in text; take it out"
     if mark is None:
         return 0, problem if isinstance(error, yaml.YAMLError) else _TAGGED
     lines = [*text.split("\n"), ""]
@@ -138,7 +138,7 @@ def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
         (opened in ("*", "&") or "alias" in problem, "text that begins with * or & needs quotes"),
         (this[mark.column :][:1] in ("!", "=") or "tag" in problem, _TAGGED),
         ("unhashable" in problem, "a key of this line is a list or a group; keys are text"),
-        ("another document" in problem, "a second document begins here; settings are one"),
+        ("another document" in problem, "a second document begins here; settings are a single one"),
         (of_key and _NO_SPACE.match(this), "a space is missing after the colon of this line"),
         (of_key and _NO_SPACE.match(above), "a space is missing after the colon of the line above"),
         (of_key and ": " in this[: mark.column], "a colon is missing, or a value that has a colon needs quotes"),

@@ -55,8 +55,8 @@ class Kept:
 class Fit:
     """The fit of a view to another: its shift across and down, with the standard deviation `sigma` by noise, and the
     remainder as a shift; all in pixels. `places`: sum of squares of the shares that the places of single views have in
-    the shift. `off`: by which, as a shift of all, the kept view may miss the other although nothing moved, beyond the
-    limit of a change.
+    the shift. `unsure`: pixels by which the kept view, carried on by its velocity, may miss the other though nothing
+    moved; 0 where that is within the limit of a change.
     """
 
     across: float
@@ -64,7 +64,7 @@ class Fit:
     remainder: float
     sigma: float
     places: float = 2.0
-    off: float = 0.0
+    unsure: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,24 +134,24 @@ class OppositeCheck(Logged):
         if not mirrored and (one.again or abs(turn) > beside):
             return None
         steps = (turn - other if mirrored else turn) / step
-        off = self._off(one, one.after, steps, grid)
-        fit = lay_on(one, steps, view, grid, mirrored=mirrored) if math.isfinite(off) else None
+        unsure = self._unsure(one, one.after, steps, grid)
+        fit = lay_on(one, steps, view, grid, mirrored=mirrored) if math.isfinite(unsure) else None
         if fit is None:
             return None
-        fit = replace(fit, off=off)
+        fit = replace(fit, unsure=unsure)
         looked = (
             self._mirrored(state, one, fit, view, context)
             if mirrored
             else Look(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", context))
         )
-        if off and looked.flag is None:
+        if unsure and looked.flag is None:
             return None
         one = replace(one, turned=one.turned or mirrored, again=one.again or not mirrored)
         return replace(looked, state=replace(looked.state, kept=(*state.kept[:at], one, *state.kept[at + 1 :])))
 
-    def _off(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
+    def _unsure(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
         """Pixels, as a shift of all, by which a kept view with its velocity may miss one some steps later; see
-        `Fit.off`.
+        `Fit.unsure`.
 
         A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
         differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that
@@ -168,8 +168,8 @@ class OppositeCheck(Logged):
             or max(abs(fit.down), abs(fit.across) - rim) > max(self.warn, CELLS[0] * grid.cell, SIGMAS * fit.sigma)
         ):
             return math.inf
-        off = math.sqrt(1.5) * abs(steps * (steps - 1)) / 2 / smooth * fit.remainder**2
-        return off * (off > max(self.changed, CELLS[1] * grid.cell))
+        unsure = math.sqrt(1.5) * abs(steps * (steps - 1)) / 2 / smooth * fit.remainder**2
+        return unsure * (unsure > max(self.changed, CELLS[1] * grid.cell))
 
     def _mirrored(
         self, state: OppositeState, one: Kept, fit: Fit, view: CellView, context: ScanContext
@@ -181,11 +181,11 @@ class OppositeCheck(Logged):
         usual = axis if state.axis is None else state.axis
         moved = replace(fit, across=2 * (axis - usual))
         flag = self._moved(moved, view.index, f"frame {one.view.index}, from the other side", context)
-        state = state if fit.off else replace(state, axis=usual)
+        state = state if fit.unsure else replace(state, axis=usual)
         stated = context.axis_col
         shaken = SHAKEN * math.sqrt(fit.places) * context.shake[0] / 2
         limit = max(self.axis, CELLS[2] * cell, shaken)
-        if fit.off or flag is not None or not first or stated is None or abs(axis - stated) <= limit:
+        if fit.unsure or flag is not None or not first or stated is None or abs(axis - stated) <= limit:
             return Look(state, flag)
         advice = (
             f"By frames {one.view.index} and {view.index}, from opposite sides, the axis is at column "
@@ -199,7 +199,7 @@ class OppositeCheck(Logged):
         # The first pair, which gave the axis, had views beside the sample's way, too.
         shaken = SHAKEN * math.sqrt(2 * fit.places) * math.hypot(*context.shake)
         moves = self.warn, CELLS[0] * cell, SIGMAS * fit.sigma, shaken
-        limits = max(fit.off, *moves), max(fit.off, self.changed, CELLS[1] * cell)
+        limits = max(fit.unsure, *moves), max(fit.unsure, self.changed, CELLS[1] * cell)
         if moved <= limits[0] and fit.remainder <= limits[1]:
             return None
         score, limit = (moved, limits[0]) if moved > limits[0] else (fit.remainder, limits[1])

@@ -198,10 +198,8 @@ class ShownScan:
         frames = self._views.frames[np.isfinite(self._degrees)]
         if not frames.size:
             raise DataError(f"{self._source.path} states no angles, which a slice needs: give --angles FILE.")
-        some, band = (
-            spread_views(self._source.table.angles[frames], _VIEWS, frames),
-            range(max(near, 0), min(far + 1, rows)),
-        )
+        some = spread_views(self._source.table.angles[frames], _VIEWS, frames)
+        band = range(max(near, 0), min(far + 1, rows))
         try:
             self._correction = self._correction or ScanCorrection(self._source, Selection(), lambda _: None)
             corrected = self._correction.at_once(some, slice(band.start, band.stop))

@@ -30,12 +30,12 @@ from recon.prep.correct import (
     Correction,
     LineIntegralCorrection,
     Projections,
-    Transmission,
     UnlitViewsError,
     merge_and_empty,
     provisional,
 )
 from recon.prep.counts import Photons
+from recon.prep.spots import Transmission
 from recon.prep.unmeasured import foreign_rows
 
 _COPIES = 3  # float32 copies of the views that are corrected at once
@@ -131,8 +131,8 @@ class ScanCorrection:
         """
         if self.photons is not None:
             raise DataError(
-                f"{self._source.path}: --noise counts needs all views in "
-                f"memory. Give --noise log, or --bin {2 * self.binning}."
+                f"{self._source.path}: --noise counts needs all views in memory. Give --noise log, or --bin "
+                f"{2 * self.binning}."
             )
         self._look_for_shadow(frames)
         in_time, frames = np.sort(frames), frames[self._by_angle(frames)]
@@ -181,8 +181,7 @@ class ScanCorrection:
         Raises:
             DataError: as `at_once`.
         """
-        asked = frames
-        data, frames = self._read(frames, None)
+        asked, (data, frames) = frames, self._read(frames, None)
         self._tell_unlit(asked, frames)
         self._fed = np.append(self._fed, frames)
         if self._stream is None:
@@ -237,9 +236,8 @@ class ScanCorrection:
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
         """Whether an object stands in the beam of these views of a finished scan that `feed` took for sample."""
         self._look_for_shadow(views)
-        return (
-            self._shadow is not self._fed_by and self._shadow is not None and any(part.any() for part in self._shadow)
-        )
+        found = self._shadow
+        return found is not None and found is not self._fed_by and any(part.any() for part in found)
 
     def quiet(self) -> ScanCorrection:
         """A correction with the same references for a few views, without warnings."""
@@ -288,10 +286,9 @@ class ScanCorrection:
         copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
         if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
             self._warn(
-                f"{count(len(copies), 'view')} of {self._source.table.views.size} "
-                f"(frames {spans(copies)}) hold the pixels of the view "
-                "before: the camera or its driver gave an image twice. Their angles are then wrong for what they show: "
-                "leave them out with --views or --flags judge, or repeat them."
+                f"{count(len(copies), 'view')} of {self._source.table.views.size} (frames {spans(copies)}) hold the "
+                "pixels of the view before: the camera or its driver gave an image twice. Their angles are then wrong "
+                "for what they show: leave them out with --views or --flags judge, or repeat them."
             )
 
     def _no_view(self) -> NoViewError:
@@ -314,9 +311,9 @@ class ScanCorrection:
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self._source, asked, lit)) else ""
         self._named_unlit.update(news.tolist())
         self._warn(
-            f"{count(news.size, 'view')} of {self._source.table.views.size} "
-            f"(frames {spans(news.tolist())}) have no light: the shutter "
-            f"was closed, the beam was gone, or the file was never written there. They are left out{gap}."
+            f"{count(news.size, 'view')} of {self._source.table.views.size} (frames {spans(news.tolist())}) have no "
+            "light: the shutter was closed, the beam was gone, or the file was never written there. They are left "
+            f"out{gap}."
         )
 
     def _look_for_shadow(self, views: NDArray[np.int64]) -> None:

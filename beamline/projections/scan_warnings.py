@@ -105,7 +105,7 @@ def passing_sentence(ranges: Mapping[str, tuple[int, int]], n_views: int) -> str
 
 def report_defects(prepared: PreparedProjections, first_row: int, binning: int, warn: Warn) -> None:
     """Name slices (of a cone, rows) that no ray measured; beside them what measured nothing, by frames, rows and
-    columns, spots left as they are, and repaired pixels if more than one in a thousand.
+    columns, bright spots that stay, and repaired pixels if more than one in a thousand.
 
     Args:
         first_row: of the detector, at which the (binned) rows begin.
@@ -126,11 +126,9 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
             "where views were shifted or turned before, or something opaque in the beam that is not the sample, such "
             "as a post or a clamp. These rays have no weight."
         )
-    if projections.left:
-        large = (
-            f"{projections.left} pixels brighter than the open beam are of spots of more than 3 x 3 pixels, which stay"
-        )
-        warn(Note(f"{large} and make streaks: shield the detector against scattered and direct X-rays."))
+    if n := projections.spots_left:
+        large = f"Bright spots larger than 3 x 3 pixels ({count(n, 'pixel')} brighter than the open beam) stay and make"
+        warn(Note(f"{large} streaks: shield the detector against scattered and direct X-rays."))
     shares = (
         (unseen.mean(), Note, "of the detector got no beam, or is saturated: its rays count as not measured."),
         (

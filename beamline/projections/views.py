@@ -42,7 +42,7 @@ def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
         ConfigError: the selection does not fit the scan.
         DataError: the poses do not fit the scan.
     """
-    frames = source.table.placed_views
+    frames = source.table.views_with_angles
     poses = poses_of(source, selection, frames)
     if poses is not None:
         frames = frames[poses.stated(frames)]

@@ -46,7 +46,7 @@ from recon.splatting.in_time import LastRound
 from recon.voxels.projector import measured_share
 from recon.warm_up import warm_up
 
-_GUESSED = 0.5  # of the rays of a voxel, by which FDK that fills their rows only guesses it
+_GUESSED = 0.5  # of the rays of a voxel: where so many are of filled rows, FDK only guesses it
 
 
 def progress_events(
@@ -191,7 +191,7 @@ def runner_of(
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
     """Reconstruct in slabs, or at once; returns the volume, 0 where no ray measured it, and the views as used.
 
-    FDK takes filled rows where others see a voxel, too; one of which they are half the rays is not measured either.
+    Filled rows count for FDK: a voxel with half of its rays in them, or more, is not measured either.
     """
     made, used = _volume_of(job, decided)
     lost, volume, geometry = np.setdiff1d(*used.unmeasured_rows), made.volume, used.geometry

@@ -50,12 +50,12 @@ _AXIS_MOVES = 1.0  # px: a larger move of the axis restarts the fit
 
 # Why all views are corrected again.
 _OUTDATED = (
-    "Flats or darks came after views, air columns changed, or views between others came later, beside which spots "
-    "show: all views are corrected again"
+    "Flats or darks came after views, air columns changed, or new views lie between earlier ones, with which bright "
+    "spots are found: all views are corrected again"
 )
 _NEXT_PART = "Views of the next part of the run begin: all views are corrected again, each by the flats of its own part"
 _SEVERAL_PARTS = "The run has several parts: at its end all views are corrected again, in one piece"
-_WIDE = "The wide views of the scan are corrected with all others, as the volume of a wide sample takes them"
+_WIDE = "The volume takes the wide views of its scan, too: all views are corrected again, with these"
 _SHADED = "Something stands in the beam of all views, though not of the flats: all views are corrected again without it"
 
 
@@ -234,7 +234,7 @@ class ScanFollower:
         """Recompute line integrals with all references and air columns, replacing those that the model was fitted to.
 
         Does nothing if the views are of one part, references and air columns are unchanged, nothing stands in the beam
-        of all views, and no wide ones (rows of the file) join them. `why` is reported, unless views are unlearned.
+        of all views, and no `wide` ones (rows of the file) join them. `why` is reported, unless views are unlearned.
 
         Some of these views may become unusable: a check found them bad when it had seen later ones, or they were taken
         again. Then the model goes on without them, at the first rates.
@@ -371,9 +371,8 @@ class ScanFollower:
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved
             if isinstance(step, ScanStep):
                 try:
-                    done[step.name] = step.apply(
-                        prepared, self.source.table.angles[projections.view_ids], lambda n, of: None
-                    )
+                    angles = self.source.table.angles[projections.view_ids]
+                    done[step.name] = step.apply(prepared, angles, lambda n, of: None)
                 except DataError as error:  # not a reason to discard the volume
                     self._warn(str(error))
                     continue

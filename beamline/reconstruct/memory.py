@@ -95,9 +95,8 @@ class ReconMemory:
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)
         rays = (1 + self.weighted) * 4 * part.n_views * math.prod(part.detector_shape)
-        return (
-            self.weights + rays + self._work(for_part(self.method, seen, self.rows, self.rows), part, self._grid(seen))
-        )
+        work = self._work(for_part(self.method, seen, self.rows, self.rows), part, self._grid(seen))
+        return self.weights + rays + work
 
     def _work(self, method: Method, geometry: Geometry, grid: Grid) -> int:
         """The method, or its error bars beside its volume."""

@@ -50,10 +50,8 @@ class NamedArray:
         packed = None
         if array.dtype.kind in "uif":
             packed = packing(self.attrs, array.dtype, f"{name} in {file.filename}", by_cil=False)
-        self._values, self.dtype = (
-            packed or np.asarray,
-            np.result_type(array.dtype, np.float32) if packed else array.dtype,
-        )
+        self._values = packed or np.asarray
+        self.dtype = np.result_type(array.dtype, np.float32) if packed else array.dtype
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.array, name)
@@ -66,7 +64,7 @@ class NamedArray:
 
 
 class ArrayFile(dict[str, NamedArray]):
-    """The arrays of a file by the paths of their names; "" is the only one of a file."""
+    """The arrays of a file by their paths; "" stands for the only one."""
 
     def __init__(self, path: Path) -> None:
         self.filename, self.attrs, self.close = str(path), dict[str, Any](), lambda: None
@@ -91,7 +89,7 @@ class ArrayFile(dict[str, NamedArray]):
 
 
 def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz by their names, in memory, or that of an .npy as "".
+    """The arrays of an .npz by their names, in memory; that of an .npy by "".
 
     Raises:
         DataError: the memory does not hold them, or some are objects of Python.
@@ -129,7 +127,7 @@ def open_array_file(path: Path, follow: bool = False) -> Any:
     return ArrayFile(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
 
 
-_RUNS = (
+_PICKLE = (
     "{0} is a pickle, which is never opened here: it may run any program that its writer put into it. If you trust the "
     'writer, convert FILE (as NAF and SAX-NeRF have it): python -c "import numpy as np, pickle; d = pickle.load(open('
     "'FILE', 'rb')); np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
@@ -143,7 +141,7 @@ _PICKLES, _NUMPY = (".pickle", ".pkl", ".pck"), (".npy", ".npz")
 def holds_arrays(path: Path) -> bool:
     """Whether a path is an .npy, an .npz or a Zarr. DataError: a pickle, whose arrays are read once converted."""
     if path.is_file() and path.suffix.lower() in _PICKLES:
-        raise DataError(_RUNS.replace("{0}", str(path)))
+        raise DataError(_PICKLE.replace("{0}", str(path)))
     return (path.suffix.lower() in _NUMPY and path.is_file()) or zarr_root(path) is not None
 
 

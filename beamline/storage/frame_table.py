@@ -19,7 +19,7 @@ _NONE, _FIRST = np.zeros(0, np.int64), np.zeros(1, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class FrameTable:
-    """The frames of a scan. A selection, an order, a join of frames is `take` and `concat` of tables.
+    """The frames of a scan. Frames are selected and reordered by `take`, and joined by `concat`.
 
     Nothing is guessed: what is unknown of a frame is NaN or -1, a column that a scan does not have is None. Arrays are
     not written to: `dataclasses.replace` makes a table with other columns.
@@ -36,7 +36,7 @@ class FrameTable:
         pass_ends: int64 [pass], rows at the end of each pass of views; empty where the scan has none.
         times: float64 [frame], s at the trigger.
         replaces: int64 [frame], the row of the view that a frame repeats (the old row is then INVALID).
-        numbers: int64 [frame], in the names of the files of single frames.
+        numbers: int64 [frame], in the name of the file of each frame.
         aside: float64 [frame], mm, as of `Frame`.
         shifts: float64 [frame, 2], displacement of the image along (columns, rows) in pixels.
         energies: float64 [frame], keV.
@@ -108,7 +108,7 @@ class FrameTable:
         return self.of_kind(FrameKind.WIDE_VIEW)
 
     @cached_property
-    def placed_views(self) -> I64:
+    def views_with_angles(self) -> I64:
         """Rows of the projections whose angles are known."""
         return self.views[np.isfinite(self.angles[self.views])]
 
@@ -127,11 +127,11 @@ class FrameTable:
         return self.views[slice(*np.searchsorted(self.views, (first, end)))]
 
     def numbers_taken(self, first: int = 0, kind: int = FrameKind.PROJECTION) -> frozenset[int]:
-        """Numbers of the planned views that are there, from 0: a view that was taken again has that of the first.
+        """Numbers, from 0, of the planned views that were taken. A view taken again has the number of the first.
 
         Args:
-            first: the row from which on frames count.
-            kind: of these frames.
+            first: the row from which frames count.
+            kind: of frames that count.
         """
         rows, numbers = self.of_kind(kind), set[int]()
         for row in rows[rows >= first].tolist():
@@ -141,7 +141,7 @@ class FrameTable:
         return frozenset(numbers)
 
     def kind(self, row: int) -> FrameKind:
-        """Of one frame."""
+        """The kind of one frame."""
         return FrameKind(int(self.kinds[row]))
 
     def has(self, *kinds: int) -> bool:
@@ -149,7 +149,7 @@ class FrameTable:
         return set(kinds) <= {*self.kinds.tolist()}
 
     def frame(self, row: int, counts: NDArray[np.uint16], kind: FrameKind | None = None) -> Frame:
-        """A frame with all that is known of it; `kind`: another one than the table's."""
+        """A frame with all that is known of it; `kind` replaces that of the table."""
         return Frame(
             counts=counts,
             kind=self.kind(row) if kind is None else kind,
@@ -175,7 +175,7 @@ class FrameTable:
             name: None if (column := getattr(self, name)) is None else column[rows] for name in _ARRAYS
         }
         if self.replaces is not None:
-            place = np.full(len(self) + 1, -1)  # the last stands for what repeats none
+            place = np.full(len(self) + 1, -1)  # its last one is read by -1: repeats none
             place[rows] = np.arange(rows.size)
             own["replaces"] = place[own["replaces"]]
         starts, ends = np.unique(np.searchsorted(rows, self.part_starts)), np.searchsorted(rows, self.pass_ends)
@@ -184,7 +184,7 @@ class FrameTable:
 
     @staticmethod
     def concat(tables: Sequence[FrameTable]) -> FrameTable:
-        """The frames of all tables, one after another; each is one part or more. Numbers in names do not go on."""
+        """The frames of all tables, one after another; each is one part or more. Numbers of files are dropped."""
         if len(tables) == 1:
             return tables[0]
         sizes = [len(table) for table in tables]

@@ -1,4 +1,4 @@
-"""The frames of a scan file of this program as they were recorded: their table, and whether each row still says so."""
+"""Frames as a scan file of this program records them: their table, and rows that no longer match their checksum."""
 
 from __future__ import annotations
 

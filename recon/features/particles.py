@@ -13,7 +13,7 @@ from skimage.morphology import ball, local_maxima, reconstruction
 from skimage.segmentation import watershed
 
 from recon.base.arrays import F32, Mask
-from recon.base.choices import NECK as NECK
+from recon.base.choices import NECK
 
 Labels = NDArray[np.int32]
 

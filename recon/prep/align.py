@@ -19,10 +19,9 @@ from scipy.ndimage import uniform_filter1d
 from recon.base.declared_types import check_arguments
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.prep.axis_ends import axis_from_ends
-from recon.prep.axis_wedge import AGREE, MOST_ROWS, Floats, few_rows, is_cut_off, lowest, optimum
+from recon.prep.axis_wedge import AGREE, MOST_ROWS, Floats, axis_from_sinogram, few_rows, is_cut_off, lowest, optimum
 from recon.prep.axis_wedge import AxisError as AxisError
 from recon.prep.axis_wedge import AxisEstimate as AxisEstimate
-from recon.prep.axis_wedge import axis_from_sinogram as axis_from_sinogram
 
 _FEWEST_PAIRS, _MOST_PAIRS = 8, 64
 _FEWEST = 2  # columns at each edge that are too near to it for an axis

@@ -25,8 +25,7 @@ from recon.prep.references import (
     edge_profiles,
     flat_at,
 )
-from recon.prep.spots import SpotFilter
-from recon.prep.spots import Transmission as Transmission
+from recon.prep.spots import SpotFilter, Transmission
 from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
 
 _NOISY = 0.01  # of the line integrals of a view are below 0, where air has noise
@@ -85,7 +84,7 @@ class Projections:
             pixels; None: photons were not counted.
         unmeasured: int64 [run, 4], pixels that measured nothing in a view, filled from their neighbours: the view's
             number, row, first column, column after the last.
-        left: pixels of spots that were too large to be filled, in these views and those before.
+        spots_left: pixels of bright spots that were too large to be filled, in these views and those before.
     """
 
     data: NDArray[np.float32]
@@ -97,7 +96,7 @@ class Projections:
     replaced: float = 0.0
     weights: NDArray[np.float32] | None = None
     unmeasured: I64 = field(default_factory=NO_RUNS.copy)
-    left: int = 0
+    spots_left: int = 0
 
     @property
     def lit(self) -> Mask | None:
@@ -423,4 +422,4 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
             part = parts.pop(0).data
             data[at : at + len(part)] = part
             at += len(part)
-    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs, last.left)
+    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs, last.spots_left)

@@ -1,4 +1,4 @@
-"""finish: the volume of a fit, refined on voxels with the prior that views held out prefer.
+"""Finish: the volume of a fit, refined on voxels with the prior that views held out prefer.
 
 Gaussians describe smooth matter in few parameters, and leave sharp edges, cracks and pores to the last: where a fit
 ends, they are in its residual. On voxels a few sweeps over the views bring them back.
@@ -27,13 +27,12 @@ from recon.voxels.iterative import TrialWatch, Watch, solve
 from recon.voxels.methods import PnpDct
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
 from recon.voxels.projector import Projector
-from recon.voxels.trial import Trial, choose_patches, choose_weight
+from recon.voxels.trial import SUBSETS, TV_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
 
 FINISH_SWEEPS = 8
 """Of total variation after a fit. Without a finish: -1.7 dB on a teapot (docs/published.md)."""
 
-SUBSETS, TV_STEPS = 9, 3
 _REACH = 1.5  # standard deviations of a Gaussian's longest axis
 
 

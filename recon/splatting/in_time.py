@@ -12,7 +12,7 @@ import numpy as np
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl, Traits
 from recon.base.volume import Grid
-from recon.splatting.finish import FINISH_SWEEPS, SUBSETS, TV_STEPS, finish
+from recon.splatting.finish import FINISH_SWEEPS, finish
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import voxelize
@@ -21,6 +21,7 @@ from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.priors import subsets_of
 from recon.voxels.projector import Projector
+from recon.voxels.trial import SUBSETS, TV_STEPS
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
 
 FINISH_SHARE = 0.8

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
-from recon.base.choices import Loss as Loss
+from recon.base.choices import Loss
 from recon.base.geometry import Geometry, require_views
 from recon.base.masks import masked
 from recon.base.noise import noise_level

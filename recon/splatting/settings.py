@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
-from recon.base.choices import KERNEL
+from recon.base.choices import KERNEL, Loss
 from recon.base.declared_types import Checked, Count, NonNegative, Positive, check_settings
 from recon.base.empirical import (
     APART,
@@ -28,7 +28,7 @@ from recon.base.empirical import (
 )
 from recon.base.kernel import Kernel, RayModel, Truncation
 from recon.base.volume import Grid
-from recon.splatting.problem import FitProblem, Loss
+from recon.splatting.problem import FitProblem
 
 _PUBLISHED_SHRINK = 1.6  # the published split divides the widths of both halves by this
 

@@ -37,7 +37,7 @@ def predict(method: FitMethod, trial: Trial, so_far: Choice, prior: Prior) -> Pr
     """
     begin = trial.settings.now()
     tried = _Fit.of(method, trial, FIRST_SHARE)
-    smooth, best = trial.of_weight(prior.weight), so_far.least
+    smooth, best = trial.residuals_of_weight(prior.weight), so_far.least
     left, remark = tried.refined(prior), ""
     leads = best is None or significantly_better(trial.in_line_integrals(left), best, so_far.least_gain)
     if so_far.least_gain > 0 and not leads and significantly_better(smooth, left, FAR_BEHIND):
@@ -96,7 +96,7 @@ class _Fit:
         they would not lead patches either.
         """
         residuals = self._by(prior, 0.0)
-        if prior.patches and residuals.mean() < self.trial.of_weight(prior.weight).mean():
+        if prior.patches and residuals.mean() < self.trial.residuals_of_weight(prior.weight).mean():
             return self._by(prior, prior.strength)
         return residuals
 

@@ -20,9 +20,7 @@ LEAST_GAIN = 0.02
 """Share by which a costlier candidate must lower a residual. A fit of a tooth lowers it by 1.3 %, in four times the
 time."""
 
-LEFT = "root mean square left of views held out, in line integrals"
-"""What a trial states: on some rows, with rays weighed. The data residual of a volume is a share of the views."""
-
+_MEASURE = "root mean square left of views held out, in line integrals"  # by which a choice is explained
 _ERRORS = 1.0  # standard errors of the difference, up to which two candidates predict alike
 _OCTAVES = 10  # from the first strength, at most: cones of coarse voxels take 6 to 9, and 40 change nothing
 TRIALS = 4
@@ -81,7 +79,7 @@ class Choice(NamedTuple):
 
     Attributes:
         where: the part of the scan that was tried; where no candidate was, the reason.
-        least_gain: share by which a costlier candidate must lower the residual.
+        least_gain: see `LEAST_GAIN`.
         predictions: of the candidates, the simplest first.
     """
 
@@ -123,13 +121,14 @@ class Choice(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Where it was tried, with all residuals and remarks."""
+        """Where it was tried, with all residuals (of weighed rays; the data residual is a share of the views) and
+        remarks."""
         if self.at is None:
             return self.where
         named = zip(self.predictions, self.residuals, strict=True)
         listed = [f"{each.name} {left.mean():.4g}" for each, left in named if left is not None]
         remarks = [each.remark for each in self.predictions if each.remark]
-        return f"trials on {self.where}, {LEFT}: {'; '.join([*listed, *remarks])}"
+        return f"trials on {self.where}, {_MEASURE}: {'; '.join([*listed, *remarks])}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,7 +117,7 @@ def solve(
         ValueError: for shapes that disagree, values that are not finite, weights below zero or all zero, projections
             that are zero everywhere.
     """
-    problem, lines = entered(projector, projections, weight, start, nonnegative, watch, decide or Decisions())
+    problem, lines = scaled_problem(projector, projections, weight, start, nonnegative, watch, decide or Decisions())
     with threads_for(projector.grid):
         found = method.iterate(problem, lines)
     return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
@@ -135,7 +135,7 @@ def threads_for(grid: Grid) -> Iterator[None]:
         set_num_threads(threads)
 
 
-def entered(
+def scaled_problem(
     projector: Projector, projections: F32, weight: F32 | None, start: Volume | None, nonnegative: bool, watch: Watch,
     decide: Decisions,
 ) -> tuple[VoxelProblem, F32]:  # fmt: skip

@@ -67,7 +67,7 @@ class FistaTv(VoxelMethod):
         """The prediction with the best weight; with one of its own that of the method's volume."""
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(self)
-        return trial.prediction(self.name, trial.of_weight(trial.weight), Prior(trial.weight))
+        return trial.prediction(self.name, trial.residuals_of_weight(trial.weight), Prior(trial.weight))
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         return self.with_weight(problem, x)[0]
@@ -197,7 +197,7 @@ class PnpDct(VoxelMethod):
         """The prediction with the best threshold; with one of its own that of the method's volume."""
         if self.patch_threshold is not None or trial.prior is None:
             return trial.predicted(self)
-        return trial.prediction(self.name, trial.of_patches(trial.prior.strength), trial.prior)
+        return trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         first, sweeps = GoesOn(problem.go_on), 0 if x.any() else self.first_sweeps

@@ -76,7 +76,7 @@ def _summed(left: F32, views: F32, counts: Mask) -> SquaresLeft:
     return SquaresLeft(np.array(sums[0]), np.array(sums[1]), counts.sum(axis=(1, 2), dtype=np.float64))
 
 
-def volume_left(
+def left_by_volume(
     volume: Volume, views: Views, most: int, progress: Callable[[int, int], None], *, beside_uniform: bool = False
 ) -> tuple[SquaresLeft, tuple[float, float] | None]:
     """What a volume leaves of at most so many views, evenly spread.

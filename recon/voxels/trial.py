@@ -1,4 +1,4 @@
-"""Trial: volumes of seven of eight views on some rows, judged by the views held out, and the priors found so.
+"""Trial: volumes made of seven in eight views on some rows, judged by the views held out, and priors chosen so.
 
 A trial makes each candidate's volume from the views that are not held out, measures its residual of each one that is,
 and compares candidates by the rule of `recon.voxels.choice`.
@@ -32,7 +32,7 @@ from recon.voxels.residuals import unseen_residuals
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
 _WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one
-SUBSETS, TV_STEPS = 9, 3  # of a trial
+SUBSETS, TV_STEPS = 9, 3  # of a trial, and of the finish of a fit
 PATCH_STEPS = 35
 """Steps with sparse patches of a trial, and by default of `PnpDct`."""
 
@@ -103,7 +103,7 @@ def choose_patches(
         best = judge.best_patches(weight, first, steps)
         if best is None:
             return [first, 0]
-        return [best.strength, bool(best.residuals.mean() < judge.of_weight(weight).mean())]
+        return [best.strength, bool(best.residuals.mean() < judge.residuals_of_weight(weight).mean())]
 
     strength, better = problem.decide("strength", chosen)
     return Patches(strength, bool(better))
@@ -115,8 +115,8 @@ class TrialSettings:
 
     Attributes:
         wide: the grid holds a sample beyond the field.
-        all_rows: of a cone whose middle shows little matter all rows are tried, here in words, and pixels may be joined
-            for that: priors found so are not those of the volume. Empty: some rows.
+        all_rows: words for the rows of a trial of all of them, as of a cone whose middle shows little matter. Pixels
+            may be joined for it, so that its priors are not those of the volume. Empty: a trial of some rows.
         now: the clock.
     """
 
@@ -151,14 +151,14 @@ class AllColumns(NamedTuple):
 
 
 class Trial:
-    """Volumes of a slab from seven of eight views, judged by the others: which candidate predicts them.
+    """Volumes of a slab, made of seven in eight views and judged by the others, which they should predict.
 
     Attributes:
         problem: of the slab.
-        scan: of all rows.
+        scan: the problem of all rows.
         start: [y, x, z], the first volume: FBP, or none where no direct method takes the views.
         unseen: the views held out.
-        all_columns: both with all columns.
+        all_columns: the same rows with all columns.
         smooth: the volume of total variation that predicts these best, of those made so far.
         settings: of the run that the trial belongs to.
     """
@@ -181,8 +181,8 @@ class Trial:
 
         Columns of air far beside the sample are left out.
 
-        None: fewer than 16 views, a cone as `middle_of_cone`, views held out that weigh nothing in these rows, or
-        `problem.trial_goes_on` ends it.
+        None: fewer than 16 views, a cone for which `middle_of_cone` gives None, views held out that weigh nothing in
+        these rows, or `problem.trial_goes_on` ends it.
         """
         geometry, grid = problem.projector.geometry, problem.projector.grid
         if geometry.n_views < LEAST_VIEWS or not problem.trial_goes_on():
@@ -251,7 +251,7 @@ class Trial:
 
     def best_weight(self, first: float) -> BestStrength | None:
         """The weight μ of total variation for all views, searched from `first`; None: the trials were ended."""
-        best = preferred_strength(self.of_weight, first)
+        best = preferred_strength(self.residuals_of_weight, first)
         if best is None:
             return None
         of_all = replace(best, strength=best.strength * math.sqrt(ONE_IN / (ONE_IN - 1)))
@@ -260,7 +260,7 @@ class Trial:
 
     def best_patches(self, weight: float, first: float, steps: int) -> BestStrength | None:
         """The strength of so many steps with patches after total variation, searched from `first`; None: as above."""
-        smooth = self.with_weight(weight) if self.smooth is None else self.smooth
+        smooth = self.volume_of_weight(weight) if self.smooth is None else self.smooth
 
         def made(strength: float) -> F32:
             return self.volume_by(lambda part, first: pnp_dct(part, first, strength, steps=steps), smooth)
@@ -310,8 +310,8 @@ class Trial:
 
     def prediction(self, name: str, residuals: F64 | None, prior: Prior | None = None, remark: str = "") -> Prediction:
         """A prediction in the units of the scan; `prior` in those of the problem."""
-        units, weighed = self.problem.units, self.problem.weight is not None
-        of_scan = None if prior is None or self.settings.all_rows else units.prior(prior, weighed, 1)
+        weighed = self.problem.weight is not None
+        of_scan = None if prior is None or self.settings.all_rows else self.problem.units.prior(prior, weighed, 1)
         left = None if residuals is None else self.in_line_integrals(residuals).tolist()
         return Prediction(name, left, of_scan, remark)
 
@@ -338,15 +338,15 @@ class Trial:
         part = np.maximum(volume.data[:, y : y + shape[1], x : x + shape[2]], 0)
         return times_power(volume_lines(part), -self.problem.units.density)
 
-    def of_weight(self, weight: float) -> F64:
+    def residuals_of_weight(self, weight: float) -> F64:
         """Residuals for total variation of this weight; `smooth` is the best volume of all weights."""
-        return self.residuals_of("weight", weight, self.with_weight)
+        return self.residuals_of("weight", weight, self.volume_of_weight)
 
-    def of_patches(self, strength: float) -> F64 | None:
+    def residuals_of_patches(self, strength: float) -> F64 | None:
         """Residuals for patches of this strength; None: it was not tried."""
         return self._known.get(("patches", strength))
 
-    def with_weight(self, weight: float) -> F32:
+    def volume_of_weight(self, weight: float) -> F32:
         """The volume of total variation with this weight."""
         return self.volume_by(lambda part, x: ordered_fista(
             part, x, weight, self._subsets, sweeps=TRIAL_SWEEPS, tv_steps=TV_STEPS

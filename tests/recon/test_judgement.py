@@ -66,7 +66,7 @@ def test_bands_of_rows_stand_for_a_large_detector(monkeypatch: pytest.MonkeyPatc
     wrong = Volume(flat.data * np.linspace(0.8, 1.0, 24, dtype=np.float32), ball.grid)
     whole = judge(wrong, views).figures["residual"]
     monkeypatch.setattr(residuals, "RAYS", 4 * 16 * 24)
-    assert residuals.volume_left(wrong, views, 3, lambda *_: None)[0].rays.tolist() == [4 * 16 * 24] * 3
+    assert residuals.left_by_volume(wrong, views, 3, lambda *_: None)[0].rays.tolist() == [4 * 16 * 24] * 3
     assert judge(wrong, views).figures["residual"] == pytest.approx(whole, rel=1e-5)
 
 

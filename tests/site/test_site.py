@@ -135,7 +135,7 @@ np.save("scan.npy", np.arange(24, dtype=np.uint16).reshape(2, 3, 4))
 with open_scan(SourceOptions("scan.npy", angles=[0.0, 1.0])) as source:
     assert source.format == "npy_stack"
 
-from beamline.storage.writers.recon_file import ReconRecord
+from beamline.storage.recon_record import ReconRecord
 record = ReconRecord(
     volume=volume, length_unit="mm", raw_file="a", title="a", sample="a", time=0.0, parameters={}, metrics={}
 )

@@ -26,17 +26,16 @@ def framestamp_order(source: ScanSource) -> Iterator[Finding]:
     It starts again where the camera was armed anew: with other frames, or for other triggers of the same ones, or with
     another part of a joined file. Not always at 0, for the first frame may be lost.
     """
-    stamps, triggers, key = source.table.framestamps, source.table.triggers, source.table.kinds
+    table = source.table
+    stamps, triggers, key = table.framestamps, table.triggers, table.kinds
     if stamps.size < 2 or (stamps < 0).any():
         return
     steps, rows = np.diff(stamps), np.arange(key.size)
-    passes = np.searchsorted(source.table.pass_ends, rows, "right")  # one may be repeated
-    aside = (
-        np.zeros(key.size) if source.table.aside is None else source.table.aside
-    )  # wide views count on, as retakes do
+    passes = np.searchsorted(table.pass_ends, rows, "right")  # one may be repeated
+    aside = np.zeros(key.size) if table.aside is None else table.aside  # wide views count on, as retakes do
     new = np.zeros(key.size, np.bool_)
     new[np.unique(np.stack([key, triggers, passes, aside]), axis=1, return_index=True)[1]] = True
-    new[source.table.part_starts] = True
+    new[table.part_starts] = True
     armed = (np.diff(passes) > 0) | (new[1:] & ((steps < 0) | (stamps[1:] == 0)))
     same_block = (np.diff(key) == 0) & ~armed
     repeated = np.flatnonzero(same_block & (steps <= 0))

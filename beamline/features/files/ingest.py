@@ -96,7 +96,7 @@ def ingest(
 def _refuse_what_a_copy_would_not_state(source: ScanSource) -> None:
     """Raise DataError for unknown angles, displaced views, altered rows and oblong pixels."""
     n = source.table.views.size
-    if unknown := n - source.table.placed_views.size:
+    if unknown := n - source.table.views_with_angles.size:
         raise DataError(
             f"{source.path} does not say the angles of {unknown} of its {n} projections: give "
             "--angles FILE (degrees, one a line). Nothing was written."

@@ -239,7 +239,7 @@ def _scan(path: Path, facts: dict[str, Any]) -> ScanSource | None:
             raise
         return None
     is_zip = path.suffix.lower() == ".zip"  # which no volume is
-    if is_zip or source.table.views.size < len(source.table) or source.table.placed_views.size:
+    if is_zip or source.table.views.size < len(source.table) or source.table.views_with_angles.size:
         return source
     source.close()
     return None

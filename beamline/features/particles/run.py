@@ -23,10 +23,10 @@ from beamline.storage import hdf5
 from beamline.storage.readers.open import open_scan
 from beamline.storage.volumes.files import opened_volume
 from beamline.storage.writers.recon_file import DEVIATION, new_plot
+from recon.base.choices import NECK
 from recon.base.greys import matter_window
 from recon.base.volume import Grid, Volume
 from recon.features.particles import (
-    NECK,
     Particles,
     bodies_outside,
     cleaned,

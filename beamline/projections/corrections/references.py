@@ -96,9 +96,9 @@ def read_references(
     """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are required.
 
     Frames that are damaged (see ScanSource) are left out, unless the selection uses all, and bright spots of single
-    frames, which are told. The light of flats with an exposure of their own is scaled to the projections': dark +
-    (flat - its dark) * t / t_flat, where both are known. Of darks of several exposures each kind of frame has its own,
-    see `recon.prep.references.dark_at`.
+    frames are filled, with a note. The light of flats with an exposure of their own is scaled to the projections':
+    dark + (flat - its dark) * t / t_flat, where both are known. Of darks of several exposures each kind of frame has
+    its own, see `recon.prep.references.dark_at`.
 
     Raises:
         DataError: all frames of a kind are damaged.
@@ -122,8 +122,8 @@ def read_references(
         )
     if reading.spots:
         n, frames = sum(reading.spots.values()), spans(sorted(reading.spots))
-        told = f"{count(n, 'pixel')} of darks and flats (frames {frames}) were bright spots of single frames (zingers)"
-        warn(Note(f"{told}: filled from the frames beside them."))
+        spots = f"Bright spots of single darks and flats (zingers: {count(n, 'pixel')} in frames {frames})"
+        warn(Note(f"{spots} were filled from the frames beside them."))
     return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.table.part_starts.tolist()))
 
 
@@ -195,14 +195,10 @@ def current_scale(source: ScanSource) -> NDArray[np.float64]:
 def uncorrected_current(source: ScanSource, selection: Selection) -> str:
     """The warning that the ring current changed between flats and views and is not corrected; "" if it did not
     change."""
-    used = source.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
-    if (
-        source.quantity != "counts"
-        or selection.step(Preparation).by_current
-        or (known := source.table.currents) is None
-    ):
+    known = source.table.currents
+    if source.quantity != "counts" or selection.step(Preparation).by_current or known is None:
         return ""
-    currents = known[used]
+    currents = known[source.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)]
     if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():
         return ""
     return (

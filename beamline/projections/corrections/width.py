@@ -152,7 +152,7 @@ class Width:
             return None
         if self.arc != "auto":
             arc, skew = ([math.radians(float(part)) for part in self.arc.split(":")] + [0.0])[:2]
-            sense = -1.0 if _step(_of_views(source, source.table.angles)) < 0 else 1.0
+            sense = -1.0 if _step(source.table.angles[source.table.views]) < 0 else 1.0
             return _Motion(sense * arc, sense * skew / max(source.shape[0] - 1, 1))
         return stated_motion(source)
 
@@ -167,16 +167,11 @@ def stated_motion(source: ScanSource) -> _Motion | None:
     plan, period = source.plan, source.attributes.get("period_s")
     if not (plan.get("mode") == "fly" or plan.get("fly") is True) or not isinstance(period, float) or period <= 0:
         return None
-    exposures = _of_views(source, source.table.exposures)
+    exposures = source.table.exposures[source.table.views]
     if not np.isfinite(exposures).any():
         return None
-    speed = _step(_of_views(source, source.table.angles)) / period
+    speed = _step(source.table.angles[source.table.views]) / period
     return _Motion(speed * float(np.nanmedian(exposures)), speed * (source.row_period or 0.0))
-
-
-def _of_views(source: ScanSource, values: NDArray[np.float64]) -> NDArray[np.float64]:
-
-    return values[source.table.views]
 
 
 def _step(angles: NDArray[np.float64]) -> float:

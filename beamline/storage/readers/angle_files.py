@@ -1,4 +1,4 @@
-"""Angles from outside the scan file: read, and laid on frames only where they fit."""
+"""Angles from outside the scan file: read, and given to frames only where their number fits."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from beamline.plan.plan import from_text
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays, open_array_file
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.readers.stacks import arrays_of, dataset_at, datasets_text, turned
+from beamline.storage.readers.stacks import arrays_of, dataset_at, datasets_text, in_frame_of_detector
 
 Angles = Path | str | ArrayLike
 """A file, or FILE::NAME of a column or a dataset, in degrees unless it states a unit; or an array in radians."""
@@ -64,7 +64,7 @@ def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> ND
         item = dataset_at(file, where)
         if item.ndim == 0 or item.size != max(item.shape):
             raise DataError(f"{item.name} in {path} has the shape {item.shape}; expected a list of angles.")
-        return turned(item, datasets.radians(item, unit, default), unit)
+        return in_frame_of_detector(item, datasets.radians(item, unit, default), unit)
 
 
 def _only_angles(file: h5py.File) -> str:

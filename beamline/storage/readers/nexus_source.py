@@ -134,16 +134,13 @@ class NexusSource(ScanSource):
             raise DataError(
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
-        self.n, known = (
-            n,
-            np.isin(keys[:n], list(FrameKind)) & (keys[:n] != FrameKind.WIDE_VIEW),
-        )  # which is never written
+        self.n, written = n, [kind for kind in FrameKind if kind is not FrameKind.WIDE_VIEW]
         seconds, times = self._seconds(places.detector, "count_time"), self._seconds(places.entry, "frame_log/time")
         exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
         logged = {f"{name}s": self._column(f"frame_log/{name}") for name in ("trigger", "framestamp")}
         own = {name: column for name, column in logged.items() if column is not None}
         self.table = FrameTable.of(
-            np.where(known, keys[:n], FrameKind.INVALID),
+            np.where(np.isin(keys[:n], written), keys[:n], FrameKind.INVALID),
             angles[:n],
             exposures,
             times=times if np.isfinite(times).any() else None,

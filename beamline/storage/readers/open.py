@@ -266,10 +266,8 @@ def _angle_table(
 
 def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
     """The detector of an NXtomo whose frames these are, the scan of Data Exchange, or a scan of these stacks."""
-    own_angles, alone = (
-        options.angles is None and options.angles_path is None,
-        not (options.darks_path or options.flats_path),
-    )
+    own_angles = options.angles is None and options.angles_path is None
+    alone = not (options.darks_path or options.flats_path)
     if alone and data.strip("/") == "exchange/data" and EXCHANGE.recognises(path, Opening()):
         return open_exchange(path, own_angles=own_angles)
     if alone and not holds_arrays(path):

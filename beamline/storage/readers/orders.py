@@ -133,11 +133,11 @@ def order_by_shapes(
 
 
 def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> ScanSource:
-    """A scan whose images, one after the other, have the dimensions that `order` names, such as "row,view,col".
+    """A scan read from images whose dimensions, one image after the other, are those of `order`: "row,view,col".
 
     Args:
-        order: None: the images are views, but for those of which one dimension counts as many as there are angles, and
-            another is one: they are a sinogram.
+        order: None: the images are views. But where there is one image, or images of one row or column, and another
+            dimension is as long as there are angles, they are a sinogram.
 
     Raises:
         DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.

@@ -187,10 +187,10 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
     source.axis_col = float((middle + plane @ (axis - end) / pitch)[1])
     angles = datasets.dataset(config, "angles")
     if angles is not None and angles.size == len(source.table):
-        source.table = replace(source.table, angles=turned(angles, datasets.radians(angles), ""))
+        source.table = replace(source.table, angles=in_frame_of_detector(angles, datasets.radians(angles), ""))
 
 
-def turned(item: Any, angles: F64, unit: str | None) -> F64:
+def in_frame_of_detector(item: Any, angles: F64, unit: str | None) -> F64:
     """Radians of views in the frame of their detector, from those of CIL's object; others as they are.
 
     Args:
@@ -207,7 +207,7 @@ def turned(item: Any, angles: F64, unit: str | None) -> F64:
 
 
 def _frame(config: h5py.Group) -> tuple[F64, F64, F64]:
-    """Along which columns, rows and the beam run."""
+    """The directions (x, y, z) in which column and row numbers rise, and that of the beam."""
     origin = datasets.attribute(datasets.resolve(config.parent, "data/data") or config, "panel_origin")
     across = _vector(config, "detector/direction_x", (1, 0, 0)) * (-1 if "right" in origin else 1)
     up = _vector(config, "detector/direction_y", (0, 0, 1)) * (-1 if "top" in origin else 1)
@@ -218,7 +218,7 @@ def _frame(config: h5py.Group) -> tuple[F64, F64, F64]:
 
 
 def _vector(config: h5py.Group, where: str, default: tuple[float, ...]) -> F64:
-    """(x, y, z); of two dimensions, z is 0."""
+    """A vector (x, y, z) of the geometry; where only two are stated, z is 0."""
     item = datasets.dataset(config, where)
     values = np.ravel(default if item is None else datasets.values_of(item)).astype(np.float64)
     return np.pad(values[:3], (0, 3 - min(values.size, 3)))

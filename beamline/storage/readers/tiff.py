@@ -26,7 +26,7 @@ from beamline.storage.structure import PACKED, is_blank
 _MOST_PAGES = 100_000
 SUFFIXES = (".tif", ".tiff")
 VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is a volume of ours, not a scan
-UNREADABLE = (*(*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, Image.DecompressionBombError),)
+UNREADABLE = (*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, Image.DecompressionBombError)
 """What tifffile, zipfile, Pillow and their decoders raise for a file that they cannot read; none of ours is among
 them."""
 _NO_IMAGE = 1 | 4  # bits of NewSubfileType: an image of reduced resolution, a mask
@@ -149,7 +149,7 @@ def images_among(names: Sequence[str]) -> list[str]:
 
 
 def no_image(path: Path, names: Sequence[str]) -> str:
-    """A sentence on a folder without images that are read, or on a picture that is not."""
+    """A sentence on a folder without images that can be read, or on a picture of a kind that is not read."""
     foreign = next((name for name in names if name.lower().endswith(FOREIGN)), None)
     if foreign is None:
         return f"{path} holds no image: no .tif, .tiff, .npy or .png file."

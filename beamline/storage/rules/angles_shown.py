@@ -114,13 +114,12 @@ class CoarseViews:
 
 def coarse_views(source: ScanSource) -> CoarseViews | None:
     """The coarse views of a scan, if it has enough views, and their line integrals are known."""
-    views = source.table.placed_views
+    views = source.table.views_with_angles
     counts = source.quantity == "counts"
     if source.quantity == "unknown" or source.table.shifts is not None:
         return None
-    if min(source.shape[1], views.size) < _LEAST_SEEN or (
-        counts and not source.table.has(FrameKind.DARK, FrameKind.FLAT)
-    ):
+    lacking = counts and not source.table.has(FrameKind.DARK, FrameKind.FLAT)
+    if lacking or min(source.shape[1], views.size) < _LEAST_SEEN:
         return None
     light = ViewLight.of(source, reference_groups(source) if counts else None)
     views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)

@@ -25,7 +25,7 @@ from beamline.storage.rules.pixels import (
     pixels_measured,
     quantity_stated,
 )
-from beamline.storage.rules.stored_order import axis_vertical, sinogram_said, views_first
+from beamline.storage.rules.stored_order import axis_vertical, sinogram_told, views_first
 from drivers.base.frame import FrameKind
 
 VARYING = "lengths"  # a rule on those that differ from view to view
@@ -187,7 +187,7 @@ SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
     views_scaled,
     axis_vertical,
     views_first,
-    sinogram_said,
+    sinogram_told,
     series_complete,
     scale_known,
     pixels_square,

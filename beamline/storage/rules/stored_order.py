@@ -22,7 +22,7 @@ _HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans hav
 
 def axis_vertical(source: ScanSource) -> Iterator[Finding]:
     """The rotation axis is parallel to the columns: each detector row then shows the same matter in every view."""
-    views = source.table.placed_views
+    views = source.table.views_with_angles
     if source.table.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
         return
     depths = _depths(source, spread(views, _TURNED))
@@ -111,20 +111,20 @@ def views_first(source: ScanSource) -> Iterator[Finding]:
 SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and `recon` show
 
 
-def sinogram_said(source: ScanSource) -> Iterator[Finding]:
-    """One array [view, col] has no rows: what is taken for its views, and how another order is said."""
+def sinogram_told(source: ScanSource) -> Iterator[Finding]:
+    """Tell what is taken for the views of an array [view, col], and how to state another order."""
     axes = str(source.attributes.get("dimensions", "")).split(",")
     if sorted(axes) == ["col", "frame"]:
         n = source.table.views.size
         first = axes[0] == "frame"
-        option = "--order col,view" if first else "--order view,col"
+        option = f"give --order {'col,view' if first else 'view,col'}"
         if source.format == "data_exchange":
-            option = f"the attribute axes of /exchange/data ({'x:theta' if first else 'theta:x'})"
+            option = f"set the attribute axes of /exchange/data to {'x:theta' if first else 'theta:x'}"
         yield Finding(
             "info",
             SINOGRAM,
             f"The array has two dimensions: it is taken as one sinogram of {n} views and {source.shape[1]} columns. "
-            f"Where these are exchanged, {option} says so.",
+            f"If they are the other way round, {option}.",
         )
 
 

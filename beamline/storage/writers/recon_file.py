@@ -22,8 +22,7 @@ from beamline.core.files import whole_file
 from beamline.core.installed import version
 from beamline.core.quantities import VoxelKind
 from beamline.storage import datasets, hdf5
-from beamline.storage.recon_record import ReconRecord as ReconRecord
-from beamline.storage.recon_record import Value
+from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.structure import require_harmless
 from beamline.storage.writer_lock import opened_whole
 from recon.base.volume import Grid, Volume, VolumeSeries

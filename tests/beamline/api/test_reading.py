@@ -17,10 +17,10 @@ import pytest
 import recon
 from beamline import api
 from beamline.core.events import Event
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.run_record import RecordFile, RunRecord
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers import layout
-from beamline.storage.writers.recon_file import ReconRecord
 from drivers.base.frame import FrameKind
 from tests.beamline.cli.small_scan import SCAN, beamline
 from tests.beamline.fakes import FakeInstrument

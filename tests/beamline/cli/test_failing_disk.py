@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from beamline.storage.writers.recon_file import ReconRecord, write_reconstruction
+from beamline.storage.recon_record import ReconRecord
+from beamline.storage.writers.recon_file import write_reconstruction
 from recon.base.volume import Grid, Volume
 from tests import faulty_disk
 from tests.beamline.cli.small_scan import SCAN

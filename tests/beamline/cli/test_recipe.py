@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
+from beamline.storage.recon_record import ReconRecord
+from beamline.storage.writers.recon_file import read_reconstruction
 from tests.beamline.cli.small_scan import SCAN, beamline, left, succeeds
 from tests.beamline.scans import write_exchange
 

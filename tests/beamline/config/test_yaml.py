@@ -74,7 +74,7 @@ FAULTS = {
     "between": ("scan:\n    mode: step\n  views: 3\n", 3, "the indentation of this line is that of no group above"),
     "at": ("sample:\n  name: @x\n", 2, "a value begins with '@'; put it into quotes"),
     "star": ("sample:\n  name: *x\n", 2, "text that begins with * or & needs quotes"),
-    "control character": ("a: 1\nb: x\0y\n", 2, "the character U+0000 belongs to no text"),
+    "control character": ("a: 1\nb: x\0y\n", 2, "the character U+0000 is not allowed in text"),
     "tag": ("a: 1\nb: !foo 3\n", 2, "text that begins with ! or = needs quotes"),
     "equals": ("a: 1\nb: =\n", 2, "text that begins with ! or = needs quotes"),
     "two documents": ("a: 1\n---\nb: 2\n", 2, "a second document begins here"),

@@ -17,7 +17,7 @@ from beamline.projections.selection import Selection
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
-from beamline.storage.writers.recon_file import ReconRecord
+from beamline.storage.recon_record import ReconRecord
 from drivers.base.clock import SystemClock
 from recon.methods import build, by_name
 from tests.beamline.scans import TwoCylinders, write_exchange

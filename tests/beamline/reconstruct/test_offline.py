@@ -21,8 +21,9 @@ from beamline.reconstruct.checkpoints import CheckpointOptions
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
-from beamline.storage.writers.recon_file import ReconRecord, read_checkpoint, read_reconstruction
+from beamline.storage.writers.recon_file import read_checkpoint, read_reconstruction
 from drivers.base.clock import SystemClock
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry

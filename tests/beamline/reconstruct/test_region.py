@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from beamline.projections import prepare
-from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
+from beamline.storage.recon_record import ReconRecord
+from beamline.storage.writers.recon_file import read_reconstruction
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
 

@@ -19,8 +19,9 @@ import pytest
 
 from beamline.reconstruct import estimate
 from beamline.reconstruct.slab_run import _as_they_come
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.partial_volume import PartialVolume, open_partial
-from beamline.storage.writers.recon_file import ReconRecord, read_reconstruction
+from beamline.storage.writers.recon_file import read_reconstruction
 from recon.forecast import Forecast
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange

@@ -52,7 +52,7 @@ def test_kinds_are_asked_by_name(table: FrameTable) -> None:
     assert table.replaced.tolist() == [4]
     unknown = table.angles.copy()
     unknown[3] = np.nan
-    assert replace(table, angles=unknown).placed_views.tolist() == [2, 5, 7, 9, 11]
+    assert replace(table, angles=unknown).views_with_angles.tolist() == [2, 5, 7, 9, 11]
 
 
 def test_triggers_count_in_their_block_where_nothing_says_them() -> None:

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
+from recon.base.method import Reconstruction
 from recon.base.volume import Grid, Volume
-from recon.reconstruction import Reconstruction, reconstruct
+from recon.reconstruction import reconstruct
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import first_volume, place
 from recon.splatting.r2 import R2

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.kernel import Truncation
-from recon.base.method import DataUse
+from recon.base.method import DataUse, Reconstruction
 from recon.base.volume import Grid
 from recon.prep.correct import References, correct
-from recon.reconstruction import Reconstruction, reconstruct
+from recon.reconstruction import reconstruct
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import without_wild_pixels

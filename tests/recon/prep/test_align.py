@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, axis_from_sinogram, find_axis
+from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, find_axis
+from recon.prep.axis_wedge import axis_from_sinogram
 from recon.prep.correct import References, correct
 
 COLS = 128

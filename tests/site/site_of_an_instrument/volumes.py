@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes.base import Slices, bare_record
-from beamline.storage.writers.recon_file import ReconRecord
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 """Angles of a table, an array or an HDF5 file are those of a text with one a line, or the file says what to name; they
-are laid on only where the counts fit."""
+are given to frames only where their number fits."""
 
 from __future__ import annotations
 

@@ -14,11 +14,11 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
 from beamline.storage.readers.open import open_scan
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.volumes import formats, suffixes_text
 from beamline.storage.volumes.base import Pixels, Slices
 from beamline.storage.volumes.files import format_of, opened_volume, volume_format, write_volume
 from beamline.storage.volumes.images import tiff
-from beamline.storage.writers.recon_file import ReconRecord
 from recon.base.volume import Grid, Volume
 
 SHAPE = 3, 4, 5

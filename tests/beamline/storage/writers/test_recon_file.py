@@ -15,10 +15,10 @@ from hypothesis.extra import numpy as hnp
 
 from beamline.core.errors import DataError
 from beamline.core.files import whole_file
+from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers import recon_file as checkpoint_file
 from beamline.storage.writers.recon_file import (
     Checkpoint,
-    ReconRecord,
     read_checkpoint,
     read_reconstruction,
     write_checkpoint,

@@ -250,7 +250,7 @@ def test_columns_of_air_hardly_change_volumes_of_a_trial(
     assert off > 5
     matter = np.hypot(x, y)[0, off:-off, off:-off] < 18
     for make in (
-        lambda trial: trial.with_weight(0.02),
+        lambda trial: trial.volume_of_weight(0.02),
         lambda trial: trial.volume_by(lambda part, first: pnp_dct(part, first, 0.01, steps=15)),
     ):
         few, many = make(narrow)[matter], make(wide)[off:-off, off:-off][matter]
