@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -29,7 +30,7 @@ from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import Rows
 from drivers.base.errors import DeviceError
-from drivers.base.frame import FrameKind
+from drivers.base.frame import Frame, FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import killed, small
 
@@ -92,10 +93,10 @@ class Chain:
     def _full(self, at: int) -> None:
         """The disk takes no frame from one on; its file is never closed, as in a process that has ended since."""
 
-        def write(table: Rows, row: int, *given: object) -> None:
-            if row == at:
+        def write(table: Rows, frame: Frame, *given: Any) -> None:
+            if frame.index == at:
                 raise OSError(errno.ENOSPC, "No space left on device")
-            usual(table, row, *given)  # type: ignore[arg-type]
+            usual(table, frame, *given)
 
         usual = Rows.write
         with self.patch.context() as patch:
