@@ -135,7 +135,7 @@ def test_tomoscan_and_nabu_take_our_scans(tmp_path: Path, made: Callable[[Path, 
     )
     assert checks.is_valid(), checks.checkup()
     assert scan.nexus_version == 1.5
-    np.testing.assert_array_equal(scan.table.kinds, scan.image_key_control)
+    np.testing.assert_array_equal(scan.image_key, scan.image_key_control)
 
     theirs = analyzer.analyze_dataset(str(path))
     assert (theirs.kind, theirs.n_angles, theirs.radio_dims) == ("nx", HALF.angles.size, SHAPE[::-1])
