@@ -15,7 +15,7 @@ from recon.base.method import Method, ReconProblem, Reconstruction, RunControl, 
 from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import CANDIDATES, by_name
-from recon.voxels.choice import LEAST_GAIN, Choice
+from recon.voxels.choice import LEAST_GAIN, TrialChoice
 from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.iterative import TrialWatch, Watch, scaled_problem, threads_for
 from recon.voxels.projector import Projector
@@ -59,7 +59,7 @@ class Auto:
             ValueError: no candidate takes these views or data.
         """
         decide = control.decide or Decisions(problem.seed)
-        choice = Choice.of(decide("method", lambda: self.choose(problem, control)))
+        choice = TrialChoice.of(decide("method", lambda: self.choose(problem, control)))
         chosen = self.candidates[-1 if choice.at is None else choice.at]
         device = problem.device if chosen.traits.device else "cpu"
         decide.prior = choice.prior
@@ -67,7 +67,7 @@ class Auto:
         settings = {**result.settings, "chosen_method": chosen.name, "chosen_because": choice.reason}
         return replace(result, settings=settings, method=chosen.name, chosen=choice.reason)
 
-    def choose(self, problem: ReconProblem, control: RunControl) -> Choice:
+    def choose(self, problem: ReconProblem, control: RunControl) -> TrialChoice:
         """Which candidate predicts views held out.
 
         Raises:
@@ -77,18 +77,18 @@ class Auto:
         if not any(np.isfinite(view).any() and np.nan_to_num(view, posinf=0, neginf=0).any() for view in data):
             raise ValueError("projections are zero everywhere: there is nothing to reconstruct")
         if problem.geometry.n_views < LEAST_VIEWS:
-            return Choice(f"{problem.geometry.n_views} views are too few to hold any out")
+            return TrialChoice(f"{problem.geometry.n_views} views are too few to hold any out")
         trial = _trial(problem, "", control, self.candidates)
         if trial is None and problem.geometry.is_cone:
             trial = _trial(*_coarse(problem), control, self.candidates)
         if control.stop():
-            return Choice("stopped before the choice")
+            return TrialChoice("stopped before the choice")
         if trial is None:
-            return Choice("views held out show nothing of the rows with most matter")
+            return TrialChoice("views held out show nothing of the rows with most matter")
         with threads_for(problem.grid):
             choice = trial.compare(self.candidates, self.least_gain)
         if trial.ended:
-            return Choice("stopped before the choice")
+            return TrialChoice("stopped before the choice")
         if choice.at is None:
             raise ValueError("; ".join(each.remark for each in choice.predictions))
         return choice

@@ -22,7 +22,7 @@ from recon.splatting.settings import DensityPolicy, FitSettings, growth
 from recon.splatting.stream import StreamingFit
 from recon.splatting.train import run_fit
 from recon.splatting.trial_fit import FIRST_SHARE, predict
-from recon.voxels.choice import Choice, Prediction
+from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.methods import PnpDct
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import Buffers, bytes_of
@@ -95,7 +95,7 @@ class R2(Checked):
         refined = FINISH_SWEEPS + PnpDct.iterations
         return PnpDct().trial_sweeps + round(FIRST_SHARE * (self.planned_steps or 0)) + refined
 
-    def predict(self, trial: Trial, so_far: Choice) -> Prediction:
+    def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction of a fit by steps with the usual finish; of another one that of its volume."""
         other = self.finish is not None or self.seconds is not None or isinstance(self.gaussians, Gaussians)
         if other or self.early_stop or trial.prior is None:

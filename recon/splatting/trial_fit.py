@@ -13,7 +13,7 @@ from recon.base.geometry import Geometry
 from recon.splatting.finish import FINISH_SWEEPS, beyond_voxels, level_of, refine
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians
-from recon.voxels.choice import Choice, Prediction, significantly_better
+from recon.voxels.choice import Prediction, TrialChoice, significantly_better
 from recon.voxels.projector import projection_lines
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem, times_power
@@ -27,7 +27,7 @@ FIRST_SHARE = 0.25
 """Of the steps of a trial fit, after which it is looked at first. Without: 0.9 CPU s more, of 3."""
 
 
-def predict(method: FitMethod, trial: Trial, so_far: Choice, prior: Prior) -> Prediction:
+def predict(method: FitMethod, trial: Trial, so_far: TrialChoice, prior: Prior) -> Prediction:
     """The prediction of a fit of the views that are not held out: a fit of all views would know the others.
 
     It ends after a quarter of its steps where it then leads the simpler candidates, or is far behind total variation.

@@ -74,7 +74,7 @@ class Prediction(NamedTuple):
     remark: str = ""
 
 
-class Choice(NamedTuple):
+class TrialChoice(NamedTuple):
     """Which candidate predicts views held out, of those tried so far.
 
     Attributes:
@@ -88,13 +88,13 @@ class Choice(NamedTuple):
     predictions: tuple[Prediction, ...] = ()
 
     @classmethod
-    def of(cls, values: Sequence[Any]) -> Choice:
+    def of(cls, values: Sequence[Any]) -> TrialChoice:
         """A choice, or its values from a file, as `Decisions` keeps it."""
         where, least_gain, predictions = values
         named = ((name, left, prior and Prior(*prior), remark) for name, left, prior, remark in predictions)
         return cls(where, least_gain, tuple(Prediction(*each) for each in named))
 
-    def after(self, prediction: Prediction) -> Choice:
+    def after(self, prediction: Prediction) -> TrialChoice:
         """The choice with one candidate more."""
         return self._replace(predictions=(*self.predictions, prediction))
 

@@ -61,7 +61,7 @@ class Displacement:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class DisplacementFit:
     """How well a volume predicts held-out views, see `judge`.
 
     Attributes:
@@ -164,7 +164,7 @@ def displacements(
 
 def judge(
     projections: F32, geometry: Geometry, parts: Parts, known: NDArray[np.bool_], moves: Sequence[Displacement]
-) -> Judgement:
+) -> DisplacementFit:
     """Deviations of held-out views, for volumes of the longest part and of all parts; arguments as for `displacements`.
 
     If the displacement is right, the other parts improve the prediction of the longest part's views.
@@ -185,7 +185,7 @@ def judge(
         return float(np.median(own)) if own.size else math.nan
 
     together = deviations(whole)
-    return Judgement(
+    return DisplacementFit(
         typical(deviations(alone), problem.longest),
         typical(together, problem.longest),
         tuple(typical(together, part) for part in range(problem.count)),

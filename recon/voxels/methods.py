@@ -16,7 +16,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Traits
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
-from recon.voxels.choice import TRIALS, Choice, Prediction
+from recon.voxels.choice import TRIALS, Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
@@ -63,7 +63,7 @@ class FistaTv(VoxelMethod):
         """Sweeps of the trials that choose the weight."""
         return 0 if self.tv_weight is not None else CHOICE_SWEEPS
 
-    def predict(self, trial: Trial, so_far: Choice) -> Prediction:
+    def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction with the best weight; with one of its own that of the method's volume."""
         if self.tv_weight is not None or trial.weight is None:
             return trial.predicted(self)
@@ -193,7 +193,7 @@ class PnpDct(VoxelMethod):
         """Steps with patches of a trial: as many as of the volume, and the usual number at most."""
         return min(self.iterations, PnpDct.iterations)
 
-    def predict(self, trial: Trial, so_far: Choice) -> Prediction:
+    def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction with the best threshold; with one of its own that of the method's volume."""
         if self.patch_threshold is not None or trial.prior is None:
             return trial.predicted(self)

@@ -23,7 +23,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, ReconProblem, RunControl
 from recon.base.view_data import split_views
 from recon.base.volume import Grid, Volume
-from recon.voxels.choice import LEAST_GAIN, BestStrength, Choice, Prediction, preferred_strength
+from recon.voxels.choice import LEAST_GAIN, BestStrength, Prediction, TrialChoice, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, TRIAL_SWEEPS
 from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
@@ -132,7 +132,7 @@ _USUAL = TrialSettings()
 class Predicting(Method, Protocol):
     """A method that tells by a part of its work how well its volume predicts views held out."""
 
-    def predict(self, trial: Trial, so_far: Choice) -> Prediction:
+    def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction of its volume; `so_far` has those of simpler candidates."""
 
 
@@ -283,7 +283,7 @@ class Trial:
             return None
         return Prior(self.weight, *choose_patches(self.scan, self.weight, lambda: self, PATCH_STEPS))
 
-    def compare(self, candidates: Sequence[Method], least_gain: float = LEAST_GAIN) -> Choice:
+    def compare(self, candidates: Sequence[Method], least_gain: float = LEAST_GAIN) -> TrialChoice:
         """Which candidate predicts the views held out; one that does not take them is not tried.
 
         A candidate is run as it is, on the views that are not held out, unless it has a method `predict`, which tells
@@ -293,7 +293,7 @@ class Trial:
             candidates: the simplest and cheapest first.
         """
         rows = self.unseen.projector.geometry.detector_shape[0]
-        choice = Choice(self.settings.all_rows or f"{rows} rows", least_gain)
+        choice = TrialChoice(self.settings.all_rows or f"{rows} rows", least_gain)
         for each in candidates:
             try:
                 prediction = each.predict(self, choice) if isinstance(each, Predicting) else self.predicted(each)

@@ -87,6 +87,7 @@ class TradeoffRequest:
         "views",
         "rows",
         "binning",
+        "seed",
         "output",
     ),
 )

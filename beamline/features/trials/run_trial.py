@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 
 from beamline.core.errors import user_message
 from beamline.core.machine import peak_memory, reset_peak_memory
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import MethodTrial, Outcome
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.run import run_on
@@ -74,7 +74,7 @@ def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProje
 
 
 def run_trial(
-    trial: Trial,
+    trial: MethodTrial,
     data: TrialData,
     seed: int,
     now: Callable[[], float] = time.perf_counter,
@@ -109,7 +109,7 @@ def run_trial(
     ), result.volume.data
 
 
-def _views_of(trial: Trial, data: TrialData) -> PreparedProjections:
+def _views_of(trial: MethodTrial, data: TrialData) -> PreparedProjections:
     if trial.choice is None:
         angles, period = data.geometry.angles, data.geometry.period
         return data.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))

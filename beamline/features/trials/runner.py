@@ -17,7 +17,7 @@ from beamline.core.recon_events import TrialDone, TrialsStarted
 from beamline.core.sinks import Warn, Warnings
 from beamline.features.trials.run_trial import TrialData, run_trial
 from beamline.features.trials.table import write_page, write_table
-from beamline.features.trials.trial import HELD_OUT, Outcome, Trial, TrialTable
+from beamline.features.trials.trial import HELD_OUT, MethodTrial, Outcome, TrialTable
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
@@ -69,7 +69,7 @@ class Planned:
 
     data: TrialData
     table: TrialTable
-    references: tuple[Trial, ...] = ()
+    references: tuple[MethodTrial, ...] = ()
 
 
 Plan = Callable[[Warn], Planned]
@@ -105,7 +105,7 @@ def opened_scan(
     return TrialData(prepared, truth), table
 
 
-def _run_and_show(slices: SliceSheet, seed: int, data: TrialData, trial: Trial) -> tuple[Outcome, F32 | None]:
+def _run_and_show(slices: SliceSheet, seed: int, data: TrialData, trial: MethodTrial) -> tuple[Outcome, F32 | None]:
     """The outcome and the volume [z, y, x] of a trial; None where it failed. The page shows baselines and rows."""
     outcome, volume = run_trial(trial, data, seed)
     if volume is not None and trial.choice is not None:
@@ -116,7 +116,7 @@ def _run_and_show(slices: SliceSheet, seed: int, data: TrialData, trial: Trial) 
 
 
 def _run_all(
-    table: TrialTable, run: Callable[[Trial], tuple[Outcome, F32 | None]], folder: Path, sink: Sink, clock: Clock
+    table: TrialTable, run: Callable[[MethodTrial], tuple[Outcome, F32 | None]], folder: Path, sink: Sink, clock: Clock
 ) -> TrialTable:
     """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
 
@@ -193,7 +193,10 @@ def run_comparison(plan: Plan, scan: ComparedScan, sink: Sink, clock: Clock) -> 
 
 
 def _with_references(
-    data: TrialData, references: Sequence[Trial], run: Callable[[Trial], tuple[Outcome, F32 | None]], seed: int
+    data: TrialData,
+    references: Sequence[MethodTrial],
+    run: Callable[[MethodTrial], tuple[Outcome, F32 | None]],
+    seed: int,
 ) -> TrialData:
     """The data with the volumes of these trials, and the dense and empty regions of the truth or of the first one.
 

@@ -13,7 +13,7 @@ from typing import Literal
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.features.trials.runner import ComparedScan, Planned, opened_scan
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import MethodTrial, Outcome
 from beamline.features.trials.view_choices import Study, ViewChoice, ViewSet
 from recon.base.choices import Filter
 from recon.base.method import Plain
@@ -46,9 +46,9 @@ def planned_study(
     n_views, given = data.geometry.n_views, dict(settings or {})
     given[BASELINE] = {"filter": ramp, **given.get(BASELINE, {})}
 
-    def trial(method: str, choice: ViewChoice) -> Trial:
+    def trial(method: str, choice: ViewChoice) -> MethodTrial:
         own = dict(given.get(method, {}))
-        return Trial("method", method, choice.n_views, settings=own, choice=choice).in_time(scan.seconds)
+        return MethodTrial("method", method, choice.n_views, settings=own, choice=choice).in_time(scan.seconds)
 
     outcomes = [(trial(method, choice), choice.reason) for choice in choices for method in scan.methods]
     table = replace(
@@ -113,20 +113,20 @@ def planned_tradeoff(scan: ComparedScan, warn: Warn, depth: Depth = "quick") -> 
     return Planned(data, table)
 
 
-def trials_of(method: str, n_views: int, depth: Depth) -> list[Trial]:
+def trials_of(method: str, n_views: int, depth: Depth) -> list[MethodTrial]:
     """The settings that are tried on all views, the baseline first.
 
     Args:
         depth: "quick" has fewer trials, and shorter ones.
     """
     if (lengths := METHODS[method].lengths) is None:
-        return [Trial("method", method, n_views)]
+        return [MethodTrial("method", method, n_views)]
     base, *others = (dict[str, Plain]({lengths.setting: length}) for length in getattr(lengths, depth))
-    varied = [Trial(lengths.setting, method, n_views, settings=each) for each in others]
-    return [Trial("method", method, n_views, settings=base), *varied]
+    varied = [MethodTrial(lengths.setting, method, n_views, settings=each) for each in others]
+    return [MethodTrial("method", method, n_views, settings=base), *varied]
 
 
-def plan(methods: Sequence[str], n_views: int, depth: Depth) -> tuple[Trial, ...]:
+def plan(methods: Sequence[str], n_views: int, depth: Depth) -> tuple[MethodTrial, ...]:
     """The trials, one setting varied at a time about each method's baseline; baselines first.
 
     Args:
@@ -142,6 +142,6 @@ def plan(methods: Sequence[str], n_views: int, depth: Depth) -> tuple[Trial, ...
     return tuple(dict.fromkeys([*(base for base, *_ in tried), *chain(*fewer)]))
 
 
-def plan_in_equal_time(methods: Sequence[str], n_views: int, seconds: float) -> tuple[Trial, ...]:
+def plan_in_equal_time(methods: Sequence[str], n_views: int, seconds: float) -> tuple[MethodTrial, ...]:
     """Each method once, all with the same time."""
     return tuple(trials_of(method, n_views, "quick")[0].in_time(seconds) for method in methods)

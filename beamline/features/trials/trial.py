@@ -1,4 +1,4 @@
-"""Trial: one reconstruction to make, and what became of it; the table of all trials, and their Pareto front."""
+"""Trial of a method: what is to be reconstructed, and what became of it; the table of all, and their Pareto front."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ENDLESS = 10**6  # steps or iterations: a time ends the run long before
 
 
 @dataclass(frozen=True)
-class Trial:
+class MethodTrial:
     """One reconstruction to make.
 
     Attributes:
@@ -59,7 +59,7 @@ class Trial:
         method, seconds = by_name(self.method), self.seconds_asked
         return build(method, {**self.settings, **({} if seconds is None else _ended_by_time(method, seconds))})
 
-    def in_time(self, seconds: float | None) -> Trial:
+    def in_time(self, seconds: float | None) -> MethodTrial:
         """The trial, to end after these seconds, if any; a direct method takes what it takes."""
         method = by_name(self.method)
         if seconds is None or method.traits.direct:
@@ -104,7 +104,7 @@ class Outcome:
         squared_residuals: of each view held out.
     """
 
-    trial: Trial
+    trial: MethodTrial
     status: Status
     seconds: float = math.nan
     peak_bytes: int | None = None

@@ -25,7 +25,7 @@ import h5py
 import numpy as np
 
 from beamline.features.trials import runner
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import MethodTrial, Outcome
 from beamline.report import figures
 from tests.beamline.conftest import BlankCanvas
 
@@ -83,7 +83,7 @@ def _whole(path: Path) -> bool:
     return data.endswith(ends.get(path.suffix, b""))
 
 
-def _made_up(trial: Trial, *_: object) -> tuple[Outcome, Any]:
+def _made_up(trial: MethodTrial, *_: object) -> tuple[Outcome, Any]:
     """A trial that takes no time."""
     amount = float(trial.views)
     volume = np.linspace(0, amount, 3200, dtype=np.float32).reshape(2, 40, 40)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from recon.base.decisions import Prior
 from recon.voxels.choice import (
-    Choice,
     Prediction,
+    TrialChoice,
     exceeds_standard_error,
     preferred_strength,
     simplest_within_one_se,
@@ -89,7 +89,7 @@ def test_trials_that_were_ended_prefer_nothing() -> None:
 
 def test_a_choice_is_the_same_from_a_file() -> None:
     """Other slabs of a volume follow that of the first one."""
-    choice = Choice("16 rows", 0.02)
+    choice = TrialChoice("16 rows", 0.02)
     for prediction in (
         Prediction("fbp", remark="fbp: not these"),
         Prediction("fista-tv", (2 + SCATTER).tolist(), Prior(0.1)),
@@ -99,8 +99,8 @@ def test_a_choice_is_the_same_from_a_file() -> None:
     assert (choice.at, choice.prior) == (2, None)
     assert choice.reason.startswith("trials on 16 rows, root mean square left of views held out")
     assert choice.reason.endswith("fista-tv 2; r2 1; fbp: not these; r2 stopped")
-    again = Choice.of(json.loads(json.dumps(choice)))
+    again = TrialChoice.of(json.loads(json.dumps(choice)))
     assert (again.at, again.reason) == (choice.at, choice.reason)
     assert again.predictions[1].prior == Prior(0.1)
     assert again.least is not None and again.least.mean() == pytest.approx(1.0)
-    assert Choice("no views").at is None and Choice("no views").reason == "no views"
+    assert TrialChoice("no views").at is None and TrialChoice("no views").reason == "no views"

@@ -13,7 +13,7 @@ import pytest
 from beamline.core.machine import STATUS, peak_memory
 from beamline.features.trials import run_trial as module
 from beamline.features.trials.run_trial import TrialData, run_trial
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import MethodTrial, Outcome
 from beamline.projections.prepared import with_views_held_out
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
@@ -40,7 +40,7 @@ def data() -> TrialData:
     return TrialData(prepared, half.truth(Grid.matching(views)))
 
 
-def run(trial: Trial, data: TrialData, seed: int, *clocks: Any) -> Outcome:
+def run(trial: MethodTrial, data: TrialData, seed: int, *clocks: Any) -> Outcome:
     return run_trial(trial, data, seed, *clocks)[0]
 
 
@@ -57,7 +57,7 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str) 
         views = replace(data.prepared.projections, data=used)
         held = np.where(measured, held, np.float32(filled))
         given = replace(data.prepared, projections=views, held_out=(held, unseen), measured=measured)
-        trial = Trial("method", method, data.geometry.n_views)
+        trial = MethodTrial("method", method, data.geometry.n_views)
         found = run(trial, replace(data, prepared=given), 0)
         figures.append([*found.metrics.values(), *found.squared_residuals])
     np.testing.assert_array_equal(figures[0], figures[1])
@@ -66,7 +66,7 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str) 
 
 
 def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> None:
-    found = run(Trial("method", "fbp", data.geometry.n_views), data, 0)
+    found = run(MethodTrial("method", "fbp", data.geometry.n_views), data, 0)
     expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
     assert data.truth is not None and data.prepared.held_out is not None
     assert found.metrics["psnr"] == pytest.approx(psnr(data.truth, expected))
@@ -83,7 +83,7 @@ def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> N
 
 def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> None:
     """Spoiling them changes its residual and nothing else."""
-    trial = Trial("method", "r2", 27, settings={"steps": 100, "gaussians": 150})
+    trial = MethodTrial("method", "r2", 27, settings={"steps": 100, "gaussians": 150})
     assert data.prepared.held_out is not None
     unseen, geometry = data.prepared.held_out
     spoilt = replace(data, prepared=replace(data.prepared, held_out=(2 * unseen, geometry)))
@@ -98,7 +98,7 @@ def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> N
 def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) -> None:
     """On a clock that goes on by a tenth of a second whenever it is asked."""
     ticks = itertools.count()
-    trial = Trial("method", method, 27, seconds_asked=8.0)
+    trial = MethodTrial("method", method, 27, seconds_asked=8.0)
     alone = replace(data, prepared=replace(data.prepared, held_out=None))
     found = run(trial, alone, 0, lambda: 0.1 * next(ticks))
     own_length = by_name(method).traits.own_length
@@ -116,7 +116,7 @@ def test_a_method_that_refuses_or_lacks_memory_is_an_outcome(
         raise error
 
     monkeypatch.setattr(module, "run_on", refuse)
-    outcome, volume = run_trial(Trial("method", "fbp", 27), data, 0)
+    outcome, volume = run_trial(MethodTrial("method", "fbp", 27), data, 0)
     assert (outcome.status, volume) == ("failed", None) and said in outcome.message
 
 
@@ -125,5 +125,5 @@ def test_the_memory_of_a_trial_is_its_own_and_not_that_of_earlier_ones(data: Tri
         pytest.skip("only Linux counts the peak anew")
     ballast = np.ones(90_000_000)  # 720 MB
     del ballast
-    peak = run(Trial("method", "fbp", 27), data, 0).peak_bytes
+    peak = run(MethodTrial("method", "fbp", 27), data, 0).peak_bytes
     assert peak is not None and peak < psutil.Process().memory_info().rss + 3e8

@@ -20,7 +20,7 @@ from beamline.features.trials import runner
 from beamline.features.trials.runner import ComparedScan, run_comparison
 from beamline.features.trials.table import text
 from beamline.features.trials.tradeoff import planned_tradeoff
-from beamline.features.trials.trial import Outcome, Trial, TrialTable
+from beamline.features.trials.trial import MethodTrial, Outcome, TrialTable
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
@@ -44,7 +44,7 @@ def run_tradeoff(scan: ComparedScan, sink: Callable[[Event], None] = lambda e: N
     return run_comparison(partial(planned_tradeoff, scan), scan, sink, SystemClock())
 
 
-def _made_up(trial: Trial, *_: object) -> tuple[Outcome, Any]:
+def _made_up(trial: MethodTrial, *_: object) -> tuple[Outcome, Any]:
     """A trial that takes no time: more work gives more quality, for more seconds and memory."""
     amount = float(int(trial.settings.get("steps") or 20) * trial.views)
     metrics = {"residual_held_out": 1 / amount, "psnr": math.log(amount)}
@@ -91,9 +91,9 @@ def test_with_a_truth_no_view_is_held_out(tmp_path: Path, made_up: object) -> No
 
 @pytest.mark.parametrize("done", [0, 3])
 def test_ctrl_c_leaves_the_trials_done_so_far(tmp_path: Path, made_up: Any, done: int) -> None:
-    begun: list[Trial] = []
+    begun: list[MethodTrial] = []
 
-    def interrupted(trial: Trial, *_: object) -> Any:
+    def interrupted(trial: MethodTrial, *_: object) -> Any:
         begun.append(trial)
         if len(begun) > done:
             raise KeyboardInterrupt

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from beamline.features.trials import runner
 from beamline.features.trials.run_trial import TrialData, averaged, measured
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import MethodTrial, Outcome
 from recon.base.volume import Grid
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.html_page import parsed_page
@@ -26,11 +26,11 @@ ERROR = 1e-3  # 1/mm, of every voxel that a row reconstructs
 
 
 @pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Trial, TrialData]]:
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[MethodTrial, TrialData]]:
     """Rows are off the truth by ERROR everywhere; the FBP of all views is the truth."""
-    found: list[tuple[Trial, TrialData]] = []
+    found: list[tuple[MethodTrial, TrialData]] = []
 
-    def trial(trial: Trial, data: TrialData, seed: int) -> tuple[Outcome, NDArray[np.float32]]:
+    def trial(trial: MethodTrial, data: TrialData, seed: int) -> tuple[Outcome, NDArray[np.float32]]:
         grid = Grid.matching(data.geometry)
         volume = SCAN.truth(grid) + np.float32(ERROR if found else 0)
         figures, _ = measured(trial.method, volume, data, grid)

@@ -18,12 +18,12 @@ from beamline.core.machine import machine
 from beamline.features.trials import table as module
 from beamline.features.trials.table import sentences, to_html, write_table
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time
-from beamline.features.trials.trial import LEAST_GAIN, Outcome, Trial, TrialTable
+from beamline.features.trials.trial import LEAST_GAIN, MethodTrial, Outcome, TrialTable
 from recon.methods import by_name, names_of_one_volume
 
 
 def test_noise_in_a_cost_puts_no_trial_on_the_front() -> None:
-    trial = Trial("method", "fbp", 10)
+    trial = MethodTrial("method", "fbp", 10)
     outcomes = [
         Outcome(replace(trial, views=views), "done", seconds, memory, {"psnr": psnr})
         for views, seconds, memory, psnr in ((10, 1.0, 400_000_000, 20.0), (20, 2.0, 400_100_000, 25.0))
@@ -35,8 +35,8 @@ def test_noise_in_a_cost_puts_no_trial_on_the_front() -> None:
 def _judged(*trials: tuple[float, list[float]]) -> TrialTable:
     """Trials of so many seconds that leave so much of each view held out; the views have a norm of 10."""
     outcomes = [
-        Outcome(Trial("method", "fbp", 10 + n), "done", seconds, metrics={"residual_held_out": sum(left) ** 0.5 / 10},
-                squared_residuals=left)
+        Outcome(MethodTrial("method", "fbp", 10 + n), "done", seconds,
+                metrics={"residual_held_out": sum(left) ** 0.5 / 10}, squared_residuals=left)
         for n, (seconds, left) in enumerate(trials)
     ]  # fmt: skip
     return TrialTable("tradeoff", "", tuple(outcomes), "residual_held_out", machine(), {}, "")
@@ -77,7 +77,8 @@ POINTS = st.lists(st.tuples(VALUES, VALUES), max_size=30)
 def _front(points: list[tuple[float, float]]) -> list[int]:
     """Numbers of the points, of so many seconds and dB, that are on the front."""
     outcomes = [
-        Outcome(Trial("method", "fbp", n), "done", cost, metrics={"psnr": db}) for n, (cost, db) in enumerate(points)
+        Outcome(MethodTrial("method", "fbp", n), "done", cost, metrics={"psnr": db})
+        for n, (cost, db) in enumerate(points)
     ]
     table = TrialTable("tradeoff", "", tuple(outcomes), "psnr", {}, {}, "")
     return [outcome.trial.views for outcome in table.front]
@@ -139,15 +140,15 @@ def test_in_equal_time_each_method_comes_once_and_nothing_but_the_time_ends_it(s
 
 
 def test_quality_is_decibels_either_way() -> None:
-    outcome = Outcome(Trial("method", "fbp", 4), "done", 1.0, metrics={"psnr": 30.0, "residual_held_out": 0.1})
+    outcome = Outcome(MethodTrial("method", "fbp", 4), "done", 1.0, metrics={"psnr": 30.0, "residual_held_out": 0.1})
     assert outcome.quality("psnr") == 30
     assert outcome.quality("residual_held_out") == pytest.approx(20)
     assert math.isnan(Outcome(outcome.trial, "failed").quality("psnr"))
     assert math.isnan(replace(outcome, metrics={"residual_held_out": 0.0}).quality("residual_held_out"))
 
 
-BASE = Trial("method", "fbp", 10)
-FIT = Trial("method", "r2", 10, settings={"steps": 100})
+BASE = MethodTrial("method", "fbp", 10)
+FIT = MethodTrial("method", "r2", 10, settings={"steps": 100})
 
 
 def _table(*outcomes: Outcome, by: str = "psnr") -> TrialTable:
@@ -155,7 +156,7 @@ def _table(*outcomes: Outcome, by: str = "psnr") -> TrialTable:
     return TrialTable("tradeoff", "What accuracy costs", outcomes, by, machine(), {"file": "a <b>.h5"}, command)
 
 
-def _done(trial: Trial, seconds: float, psnr: float, memory: int | None = 10**8) -> Outcome:
+def _done(trial: MethodTrial, seconds: float, psnr: float, memory: int | None = 10**8) -> Outcome:
     return Outcome(trial, "done", seconds, memory, {"psnr": psnr, "ssim3d": 0.5})
 
 
@@ -194,7 +195,7 @@ def test_a_trial_far_below_the_best_is_drawn_at_the_lower_edge(monkeypatch: pyte
     drawn: list[Any] = []
     monkeypatch.setattr(module, "png", lambda figure: drawn.append(figure) or b"")
     outcomes = [
-        Outcome(Trial("method", method, 10), "done", 1.0 + at, 10**8, {"psnr": db})
+        Outcome(MethodTrial("method", method, 10), "done", 1.0 + at, 10**8, {"psnr": db})
         for at, (method, db) in enumerate((("fbp", 30.0), ("sirt", 25.0), ("cgls", 1.0)))
     ]
     module.quality_plot(TrialTable("tradeoff", "", tuple(outcomes), "psnr", {}, {}, ""))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from beamline.features.trials import runner
-from beamline.features.trials.trial import Outcome, Trial
+from beamline.features.trials.trial import MethodTrial, Outcome
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -25,10 +25,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def quick_trials(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
-    seen: list[Trial] = []
+def quick_trials(monkeypatch: pytest.MonkeyPatch) -> list[MethodTrial]:
+    seen: list[MethodTrial] = []
 
-    def trial(trial: Trial, *_: object) -> tuple[Outcome, None]:
+    def trial(trial: MethodTrial, *_: object) -> tuple[Outcome, None]:
         seen.append(trial)
         return Outcome(trial, "done", float(len(seen)), 10**8, {"residual_held_out": 1 / (1 + len(seen))}), None
 
@@ -36,7 +36,7 @@ def quick_trials(monkeypatch: pytest.MonkeyPatch) -> list[Trial]:
     return seen
 
 
-def test_the_table_is_on_stdout_and_the_rest_on_stderr(folder: Path, quick_trials: list[Trial]) -> None:
+def test_the_table_is_on_stdout_and_the_rest_on_stderr(folder: Path, quick_trials: list[MethodTrial]) -> None:
     result = beamline("tradeoff", "scan.h5", "--axis", "20.7", "--methods", "fbp", "--views", "fixed:20")
     assert result.exit_code == 0, result.output
     assert (folder / "scan_tradeoff" / "tradeoff.html").is_file()
@@ -47,7 +47,7 @@ def test_the_table_is_on_stdout_and_the_rest_on_stderr(folder: Path, quick_trial
 
 
 def test_ctrl_c_is_exit_code_4_with_a_table(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, quick_trials: list[Trial]
+    folder: Path, monkeypatch: pytest.MonkeyPatch, quick_trials: list[MethodTrial]
 ) -> None:
     trial = vars(runner)["run_trial"]
 
