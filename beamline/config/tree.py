@@ -219,7 +219,6 @@ REMOVED = {
     "monitor.dark.light": "references.light_in_darks is the fraction of the flats from which darks have light",
     "recon.stop_when": "scan.decide: do with scan.wish: {quality_db: 0.5} ends a scan when all views to come would add "
     "0.5 dB at most",
-    "references.unlit": "monitor.field.unlit is the share of a flat that may be without light",
     "scan.return_views": "The check `opposite` shows motion of the sample, by views half a turn apart",
 }
 """Keys of 1.0.0 that were removed, each with what does the same."""

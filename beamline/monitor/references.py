@@ -31,6 +31,7 @@ from beamline.monitor.evidence import (
 )
 from beamline.monitor.sample_in_flats import (
     flats_below_views,
+    flats_like_views,
     views_brighter,
     views_lack_mass,
     views_show_nothing,
@@ -56,8 +57,9 @@ class ReferenceLimits:
     light_over_noise: a flat at the darks' level has no light; three times the noise of a pixel is the least that can
         be told.
     light_gone: half of the light does not go by drift, top-up or decay of the ring's current. Against the brightest
-        flats.
+        flats and against the views, which no sample makes brighter.
     uneven: flats are averaged, and views divided by the average; 0.1 of light is 0.1 of line integral.
+    unlit: a beam may be narrower than the detector, but not so that most of it is dark.
     light_in_darks: darks that are lit have a share of the flats' level and, since light brings its noise, of their
         variance. An offset has only the former, readout noise only the latter. A fifth of both is neither.
     """
@@ -74,6 +76,7 @@ class ReferenceLimits:
     uneven: Annotated[
         float, pydantic.Field(gt=0, description="relative change of the light between flats of a group")
     ] = 0.1
+    unlit: Annotated[float, pydantic.Field(gt=0, le=1, description="fraction of the frame that flats leave dark")] = 0.5
     light_in_darks: Annotated[
         float, pydantic.Field(gt=0, lt=1, description="level and variance of darks over those of flats")
     ] = 0.2
@@ -206,6 +209,19 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
             yield BadFrames([group[at] for at in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
 
 
+def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
+    """Flats darker than views, if both exposures are known: a sample only takes light."""
+    views = [view for view in evidence.views if view.saturated <= limits.saturated and view.exposure > 0]
+    limit = 1 - limits.light_gone
+    for group in evidence.of_kind(FLAT) if views else ():
+        share = evidence.light_of(group) / evidence.light_of(views)
+        if share < limit and all(flat.exposure > 0 for flat in group):
+            yield BadFrames(group, share, limit, (
+                f"they have {share:.2%} of the light of the views (limit {limit:.0%}), though a sample only "
+                "takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
+            ))  # fmt: skip
+
+
 def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
     """Flats with other light than most of their group, as a whole or in places; all, where half of them have."""
     base, limit = offset(evidence.darkest), limits.uneven
@@ -234,6 +250,18 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
             yield BadFrames(group if whole else odd, float(places.max()), limit, (
                 f"in places their light differs by {places.max():.0%} {how} (limit {limit:.0%}): something was in the "
                 "beam. Is the sample out?"
+            ))  # fmt: skip
+
+
+def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
+    """Flats that leave most of the frame dark."""
+    for group in evidence.of_kind(FLAT):
+        light = np.mean([flat.blocks for flat in group], axis=0) - offset(evidence.darkest)
+        score, limit = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean()), limits.unlit
+        if score > limit:
+            yield BadFrames(group, score, limit, (
+                f"{score:.0%} of the frame has no light in them (limit {limit:.0%}): move beam and detector onto one "
+                "another, or read fewer pixels."
             ))  # fmt: skip
 
 
@@ -266,8 +294,12 @@ RULES: tuple[tuple[str, FrameKind, Rule], ...] = (
     ("saturated", FLAT, _saturated),
     ("beam_lost", FLAT, _beam_lost),
     ("light_in_darks", DARK, _light_in_darks),
+    ("dimmer_than_views", FLAT, _dimmer_than_views),
     ("uneven", FLAT, _uneven),
+    ("mostly_unlit", FLAT, _mostly_unlit),
+    ("sample_in", FLAT, flats_like_views(single=True)),
     ("sample_in", FLAT, flats_below_views),
+    ("sample_in", FLAT, flats_like_views(single=False)),
     ("sample_in", FLAT, views_lack_mass),
     ("views_alike", FLAT, views_show_nothing),
     ("views_brighter", FLAT, views_brighter),

@@ -1,25 +1,72 @@
-"""Flats with the sample in the beam: views outshine them in places, or show nothing against them.
+"""Flats with the sample in the beam: they look like views, or leave the views without the matter that turns in them.
 
 Rules of `beamline.monitor.references`, which compare the light of flats and views at coarse places, as line integrals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamline.monitor.evidence import BRIGHT, BadFrames, Evidence, lit_places, place_noise
+from beamline.monitor.evidence import BRIGHT, DRIFT, BadFrames, Evidence, lit_places, place_noise
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, F64, Mask
 
 SIGMAS = 8.0  # standard deviations of a place
 WORST = 99.0  # percentile of the places that counts, so that zingers do not
+LIKER = 0.5  # a frame is a view rather than a flat if it differs from a view by less than this share of the difference
+CLIPPED = 0.2  # percent of the places at either end that a spread does not see: zingers
 BRIGHTER = 0.5  # flats hold the sample where places outshine them by this share of what the views take elsewhere
+LIGHTER = 0.5  # of the least mass of the sample, below which the mass in the views is too little
 AIR = 0.1  # line integral at the edges of the field from which they are no air
 EDGE = 16  # one column in so many, at each edge, is taken for air
 FEWEST, SHALLOW = 8, 10.0  # lit views at least, and percent of them that may be taken for the emptiest at a place
+OF_SHALLOW = 1.2816  # standard deviations: SHALLOW percent of noise are further below
+
+
+def flats_like_views(single: bool) -> Callable[[Evidence, Any], Iterator[BadFrames]]:
+    """The rule that flats differ less from a view than from other flats: each from those of its group, or groups."""
+    return partial(_like_views, single=single)
+
+
+def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]:
+    views, groups = evidence.lit_views, evidence.of_kind(FrameKind.FLAT)
+    if len(views) < FEWEST:
+        return
+    seen, light = [evidence.light(view) for view in views], [[evidence.light(flat) for flat in each] for each in groups]
+    if single:  # of two flats each is the other one's only witness
+        compared = [
+            ([group[i]], own[i], [np.median(rest, axis=0)])
+            for group, own in zip(groups, light, strict=True)
+            for i in range(len(group))
+            if (rest := own[:i] + own[i + 1 :])
+        ]
+    else:
+        means = [np.mean(own, axis=0) for own in light]
+        compared = [(list(group), means[i], means[:i] + means[i + 1 :]) for i, group in enumerate(groups)]
+    beside, odd = "others of their group" if single else "other flats", list[BadFrames]()
+    for frames, image, others in compared:
+        if others and (found := _nearest_view(image, others, seen)) is not None:
+            off, like, nearest = found
+            odd.append(BadFrames(frames, off, like / LIKER, (
+                f"they differ from the {beside} by {off:.3g} of line integral, and by {like:.2g} only from the view in "
+                f"frame {views[nearest].row}: the sample was in the beam."
+            )))  # fmt: skip
+    if len(odd) < len(compared):  # else a drift of the beam: each is like the views beside it
+        yield from odd
+
+
+def _nearest_view(image: F32, others: Sequence[F32], views: Sequence[F32]) -> tuple[float, float, int] | None:
+    """How much a flat differs from the most similar other flat and from the most similar view, and the number of that
+    view; None if the flat does not show the sample."""
+    lit = lit_places(np.maximum.reduce([image, *others]))
+    off = _beyond_noise(min((log_ratio(image, other, lit) for other in others), key=_spread))
+    like = [_beyond_noise(log_ratio(image, view, lit)) for view in views] if off > 0 else [np.inf]
+    nearest = int(np.argmin(like))
+    return (off, like[nearest], nearest) if like[nearest] < LIKER * off else None
 
 
 class ViewsAboveFlats(NamedTuple):
@@ -94,7 +141,8 @@ def views_lack_mass(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     """All flats show the sample, even at an angle of no view or displaced.
 
     A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are
-    as much brighter in places as darker in others. Air is at the edges of rows.
+    as much brighter in places as darker in others. Or they turn more than they hold: whatever the flats are, the views
+    differ by the sample alone, which is nowhere less than nothing in the emptiest views. Air is at the edges of rows.
     """
     if (depth := _depth_over_air(evidence)) is None:
         return
@@ -106,6 +154,16 @@ def views_lack_mass(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
             f"in places the views are brighter by {brighter:.2g} of line integral (limit {limit:.2g}) and hold no more "
             "matter elsewhere, though a sample only takes light: the sample was in the beam, or the beam changed its "
             "shape between flats and views."
+        ))  # fmt: skip
+        return
+    turning = depth - mean
+    deepest = -np.percentile(turning, SHALLOW, axis=0) - OF_SHALLOW * place_noise(turning)
+    masses, least = depth.mean(axis=(1, 2)), float(deepest.mean())
+    seen = float(masses.mean())
+    if np.percentile(deepest, WORST) > DRIFT and LIGHTER * least - seen > SIGMAS * float(masses.std()):
+        yield BadFrames(flats, seen, LIGHTER * least, (
+            f"what turns in the views takes at least {least:.2g} of line integral, the mean over the frame, but "
+            f"against these flats there is {seen:.2g} (limit {LIGHTER * least:.2g}): the sample was in the beam."
         ))  # fmt: skip
 
 
@@ -153,3 +211,18 @@ def log_ratio(image: F32, other: F32, lit: Mask) -> F32:
     least = 1e-3 * float(np.percentile(np.maximum(image, other)[lit], BRIGHT)) if lit.any() else 1.0
     least = max(least, 1e-30)
     return np.asarray(np.log(np.maximum(image[lit], least) / np.maximum(other[lit], least)), np.float32)
+
+
+def _spread(values: F32) -> float:
+    """Standard deviation without the outermost values."""
+    if not values.size:
+        return 0.0
+    low, high = np.percentile(values, (CLIPPED, 100 - CLIPPED))
+    return float(np.clip(values, low, high).std())
+
+
+def _beyond_noise(values: F32) -> float:
+    """Their spread without the noise; 0 where it may all be noise."""
+    spread, noise = _spread(values), place_noise(values)
+    chance = 1 + SIGMAS * (2 / max(values.size, 1)) ** 0.5
+    return (spread**2 - noise**2) ** 0.5 if spread**2 > chance * noise**2 else 0.0

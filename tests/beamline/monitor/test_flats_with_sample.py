@@ -18,6 +18,7 @@ DARK = 100.0
 
 Balls = list[tuple[float, float, float, float, float]]  # x, y, z, radius in px, and attenuation a px
 SOLID: Balls = [(0, 0, 0, 30, 0.004), (13, 6, 1, 7, 0.03), (-12, 10, -2, 6, 0.02), (-9, -15, 3, 5, 0.06)]
+WEAK: Balls = [(*ball, mu / 4) for *ball, mu in SOLID]  # type: ignore[misc]
 OFF: Balls = [(9, 5, 0, 14, 0.01)]
 ROUND: Balls = [(0, 0, 0, 25, 0.01)]
 WIDE: Balls = [(0, 0, 0, 86, 0.004), (60, 10, 0, 12, 0.03)]
@@ -59,6 +60,7 @@ def told(source: ArraySource) -> list[Finding]:
     ("balls", "degrees", "moved", "said"),
     [
         (SOLID, 300.0, 0.0, "in places the views are brighter"),  # the angle of no view: only its mirror image is there
+        (WEAK, 300.0, 0.0, "what turns in the views takes at least"),
         (OFF, 227.0, 0.0, "the sample was in the beam"),
         (SOLID, 0.0, 14.0, "the sample was in the beam"),
         (ROUND, 0.0, 14.0, "in places the views are brighter"),

@@ -89,6 +89,11 @@ def crossed(images: Images) -> Images:
     return [first, *images[1:]]
 
 
+def slit(images: Images) -> Images:
+    dark = frames(len(images), 0.0, 4)
+    return [np.where(np.arange(SHAPE[0])[:, None] < 24, image, d) for image, d in zip(images, dark, strict=True)]
+
+
 @pytest.mark.parametrize(
     ("spoil", "what", "said"),
     [
@@ -96,6 +101,7 @@ def crossed(images: Images) -> Images:
         (dimmed, "no_beam", "there is no beam in them"),
         (flickering, "uneven", "differs by 22% from flat to flat (limit 10%)"),
         (crossed, "uneven", "something was in the beam"),
+        (slit, "mostly_unlit", "62% of the frame has no light"),
     ],
 )
 def test_each_fault_of_flats_is_named_with_its_figure(spoil: Callable[[Images], Images], what: str, said: str) -> None:

@@ -104,7 +104,7 @@ def test_a_group_of_flats_alone_with_the_sample_in_is_refused() -> None:
     """The views outshine them in places, and hold no more matter elsewhere."""
     blocks = Blocks(1, 3)
     blocks.of(FLAT)[0][:] = blocks.of(VIEW)[0][20:23]
-    with pytest.raises(DataError, match=r"flats 3-5: in places the views are brighter"):
+    with pytest.raises(DataError, match=r"flats 4-5: in places the views are brighter"):
         decibels(blocks.source())
 
 

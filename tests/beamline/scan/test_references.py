@@ -8,6 +8,7 @@ import pytest
 from beamline.config.load import config_folder
 from beamline.core.errors import ReferencesError
 from beamline.core.events import Event
+from beamline.features.files.validate import validate
 from beamline.monitor.digest import digest
 from beamline.monitor.references import ReferenceLimits
 from beamline.scan.control import State
@@ -63,6 +64,15 @@ def test_bad_flats_at_the_end_are_told(tmp_path: Path, monkeypatch: pytest.Monke
     ran = Ran(tmp_path, FakeInstrument(at={last_view: lambda: monkeypatch.setitem(fakes.LEVEL, True, 210)}))
     assert ran.result.reference_faults == tuple(ran.warnings)
     assert [text[:46] for text in ran.warnings] == ["The flats 17-18: there is no beam in them: the"]
+
+
+def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(fakes.LEVEL, True, 2000)
+    instrument = FakeInstrument(at={5: lambda: monkeypatch.setitem(fakes.LEVEL, True, 20000)})  # the first view
+    ran = Ran(tmp_path, instrument, "scan.flats.at=start")
+    (fault,) = ran.result.reference_faults
+    assert fault.startswith("The flats 3-4: they have 9.09% of the light of the views (limit 50%)")
+    assert [finding.severity for finding in validate(ran.result.path) if fault in finding.message] == ["error"]
 
 
 def test_flats_without_beam_that_were_taken_again_are_no_fault() -> None:
