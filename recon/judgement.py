@@ -28,8 +28,8 @@ from recon.voxels.matter_checks import (
 from recon.voxels.odd_views import OddView, odd_views, odd_views_memory
 from recon.voxels.residuals import SquaresLeft, left_by_volume
 
-_VIEWS = 16  # of those used, whose residual is stated
-_ODD_VIEWS_WORK = 1.5  # projections of all rays
+_VIEWS = 16  # of those used, at most, that the residual is taken from: what it costs
+_ODD_VIEWS_WORK = 1.5  # the time of `odd_views`, in projections of all rays
 _REGIONS, _REGION = 2**21, 12  # voxels at most of regions (`metrics.sampled`); bytes of a voxel
 
 
@@ -51,6 +51,9 @@ class TimeLeft(NamedTuple):
     leaves: Callable[[float], bool] = lambda seconds: True
 
 
+_ALWAYS = TimeLeft()
+
+
 @dataclass(frozen=True, eq=False)
 class Judgement:
     """What a volume is worth.
@@ -58,7 +61,7 @@ class Judgement:
     Attributes:
         figures: of merit, by name: psnr, ssim3d, nrmse by a truth; residual, residual_held_out, unexplained, stray by
             views.
-        held_out: what the volume leaves of each view held out; None where there is none.
+        held_out: what the volume leaves of the views held out; None if none is.
         along_rows: what the volume and a uniform one leave, as of `left_by_volume`; None: not compared.
         unexplained: structure that the volume leaves in the views; None where that is not known.
         stray: mass where views show nothing; None where it was not looked for.
@@ -85,7 +88,7 @@ def judge(
     held_out: Views | None = None,
     aspects: Aspect = Aspect.RESIDUAL,
     seed: int = 0,
-    time: TimeLeft = TimeLeft(),  # noqa: B008 - a constant
+    time: TimeLeft = _ALWAYS,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Judgement:
     """Judge a volume by the views it was made of, those held out, and the true volume.

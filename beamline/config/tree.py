@@ -39,10 +39,11 @@ _NO_SPACE = re.compile(r"[\s-]*[\w.]+:[^\s:/\\]")
 class _Loader(yaml.SafeLoader):
     """Plain values; a date is text, as in the name of a sample."""
 
-    yaml_implicit_resolvers = {  # noqa: RUF012
-        first: [(tag, form) for tag, form in forms if not tag.endswith(":timestamp")]
-        for first, forms in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, form) for tag, form in forms if not tag.endswith(":timestamp")]
+    for first, forms in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
 
 
 @dataclass(frozen=True)

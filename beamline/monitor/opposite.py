@@ -55,8 +55,8 @@ class Kept:
 class Fit:
     """The fit of a view to another: its shift across and down, with the standard deviation `sigma` by noise, and the
     remainder as a shift; all in pixels. `places`: sum of squares of the shares that the places of single views have in
-    the shift. `unsure`: pixels by which the kept view, carried on by its velocity, may miss the other though nothing
-    moved; 0 where that is within the limit of a change.
+    the shift. `unsure`: by how many pixels the extrapolation of the kept view may err by itself, without any motion; 0
+    where that is within the limit of a change.
     """
 
     across: float
@@ -150,8 +150,7 @@ class OppositeCheck(Logged):
         return replace(looked, state=replace(looked.state, kept=(*state.kept[:at], one, *state.kept[at + 1 :])))
 
     def _unsure(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
-        """Pixels, as a shift of all, by which a kept view with its velocity may miss one some steps later; see
-        `Fit.unsure`.
+        """By how many pixels the extrapolation of a kept view by so many steps may err, see `Fit.unsure`.
 
         A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
         differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that

@@ -71,7 +71,7 @@ class ScanCorrection:
             warn(altered_sentence(source))
         self._beam: OpenBeam | None = None
         self._shadow: tuple[Mask, Mask] | None = None  # as of `OpenBeam.shadow`; None: not looked for
-        self._fed_by: tuple[Mask, Mask] | None = None  # the shadow by which `feed` corrects
+        self._fed_by: tuple[Mask, Mask] | None = None  # that which `feed` corrects for
         if source.quantity == "counts":
             self._beam = OpenBeam.of(source, selection, self._filters.read(None), self.rows, warn)
         elif selection.step(Preparation).noise == "counts":

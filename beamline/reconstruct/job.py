@@ -46,8 +46,6 @@ from recon.splatting.in_time import LastRound
 from recon.voxels.projector import measured_share
 from recon.warm_up import warm_up
 
-_GUESSED = 0.5  # of the rays of a voxel: where so many are of filled rows, FDK only guesses it
-
 
 def progress_events(
     sink: Sink, clock: Clock, seconds: float | None = None, waiting: Callable[[], int] = lambda: 0
@@ -189,15 +187,12 @@ def runner_of(
 
 
 def volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedProjections]:
-    """Reconstruct in slabs, or at once; returns the volume, 0 where no ray measured it, and the views as used.
-
-    Filled rows count for FDK: a voxel with half of its rays in them, or more, is not measured either.
-    """
+    """Reconstruct in slabs, or at once; returns the volume, 0 where no ray measured it, and the views as used."""
     made, used = _volume_of(job, decided)
     lost, volume, geometry = np.setdiff1d(*used.unmeasured_rows), made.volume, used.geometry
     if lost.size and geometry.is_cone:
         share = measured_share(~np.isin(np.arange(geometry.detector_shape[0]), lost), geometry, volume.grid)
-        volume.data[share <= (_GUESSED if job.method.traits.direct else 0)] = 0
+        volume.data[share <= 0] = 0
     elif lost.size and geometry.rows_show_slices and len(volume.data) == geometry.detector_shape[0]:
         volume.data[lost] = 0
     return made, used

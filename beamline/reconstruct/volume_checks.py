@@ -197,7 +197,7 @@ def _needles(made: Reconstruction, prepared: PreparedProjections) -> str:
 
 
 def odd_views_warning(odd: Sequence[OddView], prepared: PreparedProjections, context: ReportContext) -> str:
-    """The warning that names the worst of these views, by frames and pixels of the file; empty if there are none."""
+    """The warning of views that do not fit, which names the worst by frames and pixels of the file; empty without."""
     if not odd:
         return ""
     frames, binning = prepared.projections.view_ids, context.selection.binning

@@ -164,13 +164,16 @@ class FrameTable:
         )
 
     def without(self, rows: I64 | Mask) -> FrameTable:
-        """The same frames, of which some are INVALID."""
+        """The same frames, with these rows marked INVALID."""
         kinds = self.kinds.copy()
         kinds[rows] = FrameKind.INVALID
         return replace(self, kinds=kinds)
 
     def take(self, rows: I64) -> FrameTable:
-        """The frames of these rows, in that order. A view that repeats one which is not among them repeats none."""
+        """The frames of these rows, in that order. A view that repeats one which is not among them repeats none.
+
+        Parts and passes are those of the frames that are left, if the rows ascend; in another order they mean nothing.
+        """
         own: dict[str, Any] = {
             name: None if (column := getattr(self, name)) is None else column[rows] for name in _ARRAYS
         }
@@ -179,6 +182,7 @@ class FrameTable:
             place[rows] = np.arange(rows.size)
             own["replaces"] = place[own["replaces"]]
         starts, ends = np.unique(np.searchsorted(rows, self.part_starts)), np.searchsorted(rows, self.pass_ends)
+        starts = starts[(starts < rows.size) | (starts == 0)]  # a part of which no frame is left
         flags = None if self.flags is None else self.flags.of(rows)
         return FrameTable(**own, part_starts=starts, pass_ends=ends, flags=flags)
 
@@ -192,7 +196,7 @@ class FrameTable:
         columns: dict[str, Any] = {name: _joined([getattr(table, name) for table in tables], sizes) for name in _ARRAYS}
         for name in ("part_starts", "pass_ends"):
             columns[name] = np.concatenate([getattr(table, name) + n for table, n in zip(tables, before, strict=True)])
-        columns["part_starts"] = np.unique(columns["part_starts"])  # an empty part is none beside another
+        columns["part_starts"] = np.unique(columns["part_starts"])  # an empty part begins with the next
         if (replaces := columns["replaces"]) is not None:
             columns["replaces"] = np.where(replaces < 0, -1, replaces + np.repeat(before, sizes))
         flags = FrameFlags.joined([table.flags for table in tables], sizes)

@@ -362,8 +362,10 @@ class LineIntegralCorrection:
             views = Transmission(none, empty, empty, np.empty(0, np.float32))
         views = self.spots.feed(views, last, progress, order)
         replaced = float(views.repaired.sum()) / max(views.data.size, 1)
-        found = self.masked, (0, 0), replaced, None, views.unmeasured, self.spots.left
-        return Projections(views.data, views.view_ids, 0.0, views.air, *found)
+        return Projections(
+            views.data, views.view_ids, 0.0, views.air, self.masked, replaced=replaced, unmeasured=views.unmeasured,
+            spots_left=self.spots.left,
+        )  # fmt: skip
 
 
 def provisional(correction: Correction | LineIntegralCorrection) -> Projections | None:

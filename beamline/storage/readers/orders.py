@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import h5py
@@ -22,7 +22,7 @@ Order = tuple[int | None, int | None, int | None]
 
 
 class TurnedFrames:
-    """An array of any dimensions, read as [frame, row, col]. Dimensions that are none of these have length one."""
+    """An array read as [frame, row, col], whatever the order of its dimensions; others it has are of length one."""
 
     def __init__(self, item: Any, order: Order) -> None:
         self.item, self._order = item, order
@@ -94,10 +94,16 @@ def as_frames(item: Any, order: Order = USUAL) -> Any:
         return item
     places = [*dimensions_without_ones(item.shape, n)]
     if len(places) == n - 1 and (frames := order[0]) is not None:
-        order = (None, *(axis if axis is None else axis - (axis > frames) for axis in order[1:]))  # type: ignore[assignment]
+        order = _with_axes({axis: axis - (axis > frames) for axis in USUAL if axis != frames}, order)
     elif len(places) != n:
         return item
-    return TurnedFrames(item, tuple(axis if axis is None else places[axis] for axis in order))  # type: ignore[arg-type]
+    return TurnedFrames(item, _with_axes(dict(enumerate(places)), order))
+
+
+def _with_axes(new: Mapping[int, int], order: Order) -> Order:
+    """The order with other numbers of the dimensions; those that have none are not there."""
+    frames, rows, cols = (None if axis is None else new.get(axis) for axis in order)
+    return frames, rows, cols
 
 
 def stated_order(names: str) -> Order:

@@ -81,6 +81,7 @@ def test_a_selection_has_the_parts_and_passes_of_its_frames(table: FrameTable) -
     some = table.take(np.array([2, 4, 7, 9, 11]))
     assert (some.part_starts.tolist(), some.pass_ends.tolist()) == ([0, 2], [2, 5])
     assert some.replaces is not None and some.replaces.tolist() == [-1, -1, -1, 1, -1]
+    assert table.take(np.array([0, 2])).part_starts.tolist() == [0]  # no frame of the second part
 
 
 def test_what_one_table_lacks_is_unknown_in_a_join(table: FrameTable) -> None:

@@ -24,8 +24,6 @@ from recon.voxels.held_out import LEAST_VIEWS
 from recon.voxels.iterative import solve
 from recon.voxels.priors import pnp_dct
 from recon.voxels.projector import Projector
-from recon.voxels.residuals import unseen_residuals
-from recon.voxels.resolution import ViewResolution
 from recon.voxels.trial import Trial, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
 
@@ -198,18 +196,6 @@ def test_trials_see_the_columns_with_matter() -> None:
     np.testing.assert_allclose(again, images[:, :, cols], atol=1e-4 * images.max())
     full = np.ones_like(images)
     assert columns_of_matter(views, grid, full) is None
-
-
-def test_residuals_leave_out_rays_and_views_that_do_not_count() -> None:
-    views, model = np.ones((3, 4, 2), np.float32), np.full((3, 4, 2), 3.0, np.float32)
-    views[0, 0], views[1] = np.nan, np.nan
-    for geometry in (
-        Geometry.parallel(np.zeros(3), (2, 4), pixel_pitch=1.0),
-        Geometry.cone(np.zeros(3), (2, 4), sod=10.0, sdd=20.0, pixel_pitch=1.0),
-    ):
-        resolution = ViewResolution.of(geometry, Grid.matching(geometry))
-        np.testing.assert_allclose(unseen_residuals(model, views, None, resolution), [2.0, 2.0], rtol=1e-6)
-        assert np.isinf(unseen_residuals(model, views, np.zeros_like(views), resolution)).all()
 
 
 def _problem_of(data: F32, geometry: Geometry, weights: F32 | None = None) -> VoxelProblem:
