@@ -46,7 +46,8 @@ _MASS, _OUTLIERS = 0.03, 6.0  # share, as for the monitor's `mass`, and in stand
 _MASSES, _TENTHS = 0.06, (10, 90)  # share between these percentiles of views: Diamond 24737 has 0.011, a tooth 0.019
 _FEW = 0.2  # of the views: so many are named, however far they are off
 _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.009, 60 other scans at rest less
-_OF_A_STEP = 1 / 3  # off the turn with both ends, or without: they are a step apart. On other scans: 31 of 40 told, 0 of 232
+# Off the turn with both ends, or without, which are a step apart; told of 31 of 40 other scans, falsely of none of 232.
+_OF_A_STEP = 1 / 3
 _NEAR = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
 _FAINT = 0.3  # line integral: of matter fainter than that, as much as the air may have at an edge is a large part
 _FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
