@@ -24,6 +24,9 @@ NECK = 0.8  # Two parts are one particle if the neck between them has at least t
 FEW_PHOTONS = 100
 """Photons in a pixel of the open beam; with fewer, counts are better than logarithms."""
 
+SPOT_ERRORS = 8.0
+"""Standard deviations by which a bright spot is brighter, by default; noise exceeds them once in 10¹⁵ pixels."""
+
 
 def refuse_unknown_device(device: str) -> None:
     """Raises ValueError for a device that is neither "cpu" nor a CUDA device."""

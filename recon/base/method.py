@@ -283,8 +283,6 @@ class Traits:
         checkpoints: its state can be saved and continued.
         presets: a quality preset chooses its settings.
         budget: a time budget leaves out candidates of it.
-        any_grid: its model has no voxels, so that views of binned pixels still fill the full grid, and matter beyond
-            the grid is modelled, too.
         needs_matter: it refuses views without matter, such as those of a slab of air.
         in_time: it makes several volumes, at times of the scan, all at once in memory: `volumes` of them, which all
             views determine together; `Reconstruction.series` has all.
@@ -300,7 +298,6 @@ class Traits:
     checkpoints: bool = False
     presets: bool = False
     budget: bool = False
-    any_grid: bool = False
     needs_matter: bool = False
     in_time: bool = False
     least_views: int = 0

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from recon.base.arrays import I64, Mask, without_mask
+from recon.base.choices import SPOT_ERRORS
 from recon.base.declared_types import check_arguments, check_settings
 from recon.base.masks import Image, areas, fill, plan_fill
 from recon.prep.counts import Photons, of_view
@@ -53,7 +54,7 @@ class CorrectionSettings:
 
     floor: float = 1e-4
     hot_threshold: float = 10.0
-    zinger_threshold: float = 8.0
+    zinger_threshold: float = SPOT_ERRORS
     air: Literal["none", "auto"] | tuple[int, int] = "auto"
     sample_from: float = np.inf
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, I64, MEDIAN, Mask
+from recon.base.choices import SPOT_ERRORS
 from recon.base.jit import njit
 from recon.base.masks import Image, fill, plan_fill
 from recon.prep.unmeasured import DARK, NO_RUNS
@@ -19,7 +20,6 @@ _WIDEST = 3  # pixels of a spot along rows and columns
 _AROUND = 3  # pixels on each side of a spot that show how much the views differ there
 _SAMPLE, _FEWEST = 600, 30  # pixels, about, that show the noise of a view, and whether its light has changed
 _OPAQUE = DARK**0.5  # √light, below which matter shows nothing of a gap that opens in it
-_OF_REFERENCES = 8.0  # standard deviations, by which spots of darks and flats are brighter
 _MEDIAN = MEDIAN * 2**0.5  # of |x - y|, for normal variables of standard deviation 1
 
 
@@ -130,7 +130,7 @@ def without_spots(frames: Iterable[NDArray[Any]], light: float) -> Iterator[tupl
         n, beside = 0, [each for each in (before, after) if each is not None]
         if beside:
             first, second = (None if each is None else _root_of(each, light) for each in (before, after))
-            found, _ = spots(_root_of(here, light), first, second, _OF_REFERENCES, still=True)
+            found, _ = spots(_root_of(here, light), first, second, SPOT_ERRORS, still=True)
             if n := int(np.count_nonzero(found)):
                 here = np.where(found, np.mean(beside, axis=0), here)
         yield here, n

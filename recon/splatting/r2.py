@@ -57,7 +57,6 @@ class R2(Checked):
         held_out=True,
         checkpoints=True,
         presets=True,
-        any_grid=True,
         needs_matter=True,
         halo=16,
         error_bars=(2.2, 0.1),

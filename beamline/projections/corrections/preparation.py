@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, get_args
 
 from beamline.projections.step import StepDone, StepMemory, option, positive
-from recon.base.choices import FEW_PHOTONS, FlatFields, Noise
+from recon.base.choices import FEW_PHOTONS, SPOT_ERRORS, FlatFields, Noise
 
 if TYPE_CHECKING:
     from beamline.projections.protocols import ScanPart
@@ -77,7 +77,7 @@ class Preparation:
     )
     floor: float = 1e-4
     hot_threshold: float = 10.0
-    zinger_threshold: float = 8.0
+    zinger_threshold: float = SPOT_ERRORS
 
     def __post_init__(self) -> None:
         if self.gain is not None and self.noise == "log":

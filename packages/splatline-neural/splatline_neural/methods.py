@@ -51,7 +51,7 @@ class FieldMethod(ABC):
 
     name: ClassVar[str]
     label: ClassVar[str]
-    traits: ClassVar[Traits] = Traits(device=True, any_grid=True, needs_matter=True, halo=4)
+    traits: ClassVar[Traits] = Traits(device=True, needs_matter=True, halo=4)
 
     steps: int = 3000
     seconds: float | None = None
