@@ -20,6 +20,7 @@ from recon.voxels.voxel_problem import VoxelProblem
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
+from tests.slow_cases import others_slow
 
 F32 = NDArray[np.float32]
 SIDE, ROWS = 48, 8
@@ -83,7 +84,7 @@ def test_views_at_the_same_angles_bring_less_than_others() -> None:
     assert 0 < law.gain(again=32).mean < law.gain(views=32).mean
 
 
-@pytest.mark.parametrize(("n", "photons"), [(96, 300), (192, 300), (192, 3000)])
+@pytest.mark.parametrize(("n", "photons"), others_slow([(96, 300), (192, 300), (192, 3000)], 2))
 def test_the_gain_of_the_last_pass_is_measured_apart_from_the_law(n: int, photons: float) -> None:
     _, gained = law_of(n, photons)
     assert gained == pytest.approx(true_gain(n, photons), abs=0.8)
