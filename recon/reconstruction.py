@@ -28,7 +28,7 @@ from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import DEFAULT, by_name, with_trait
 from recon.prep.counts import Counts, line_integrals
-from recon.voxels.beyond_field import run_in_box_of_sample
+from recon.voxels.beyond_field import run_on_extended_grid
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -95,7 +95,7 @@ def reconstruct(
     begin = control.now()
     views = Views(data, geometry, use.weights)
     problem = ReconProblem(views, grid, use, int(seed), device)
-    result = run_in_box_of_sample(chosen, problem, control)
+    result = run_on_extended_grid(chosen, problem, control)
     return replace(
         result, settings=dict(result.settings), method=result.method or chosen.name,
         seconds=result.seconds or control.now() - begin,

@@ -151,7 +151,7 @@ class _Printable:
         return getattr(self.unfiltered, name)
 
 
-def outlast() -> None:
+def guard_streams() -> None:
     """Put `sys.stdout` and `sys.stderr` on streams that last, and that get printable text. Both, and stdin, are open
     from now on.
 
@@ -278,7 +278,7 @@ def run() -> NoReturn:
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
     os.environ["MPLBACKEND"] = "agg"  # that of a notebook that started this may be absent here: matplotlib refuses it
-    outlast()
+    guard_streams()
     code = 0
     try:
         main(prog_name="beamline")

@@ -137,7 +137,7 @@ def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
             ))  # fmt: skip
 
 
-def views_lack_mass(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
+def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     """All flats show the sample, even at an angle of no view or displaced.
 
     A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are

@@ -86,9 +86,9 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 
         phases = Phases(sink, clock)  # waiting for views does not count as work
         phases.enter("last round")
-        last_round = follower.last_round(options.streaming.seconds or MOST_SECONDS, timing.snapshot)
+        final_fit = follower.final_fit(options.streaming.seconds or MOST_SECONDS, timing.snapshot)
         channels = replace(channels, phases=phases)
-        yield Job(options, channels, prepared, facts, lambda: nullcontext(should_stop), last_round=last_round)
+        yield Job(options, channels, prepared, facts, lambda: nullcontext(should_stop), final_fit=final_fit)
     follower.snapshots.remove()
 
 

@@ -165,7 +165,7 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
         )
 
 
-def made_by(method: Method, name: str) -> Method:
+def candidate_named(method: Method, name: str) -> Method:
     """The method itself or, if it chose among candidates, the one of this name."""
     return {candidate.name: candidate for candidate in candidates_of(method)}.get(name, method)
 

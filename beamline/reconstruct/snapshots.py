@@ -53,7 +53,7 @@ class Snapshots:
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
         """Write the current volume and its picture, replacing the last ones."""
-        shown = fit.shown()
+        shown = fit.best_preview()
         (method, errors), unseen = self._method(shown), self._unseen
         record = ReconRecord(
             volume=shown.volume,

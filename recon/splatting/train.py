@@ -27,11 +27,6 @@ from recon.splatting.checkpoint import HeldOutTracker, arrays_of, state_from
 from recon.splatting.finish import finish
 from recon.splatting.fit_method import FitMethod
 from recon.splatting.gaussians import Gaussians, turned_by_rows
-from recon.splatting.in_time import (
-    FinishPlan,
-    fill_seconds,
-    planned_finish,
-)
 from recon.splatting.initialise import (
     default_count,
     first_volume,
@@ -43,6 +38,11 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
+from recon.splatting.time_limit import (
+    FinishPlan,
+    fill_seconds,
+    planned_finish,
+)
 from recon.voxels.residuals import residuals_of
 
 _TIMED = 3  # steps after which a fit's seconds are planned

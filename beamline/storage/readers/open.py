@@ -162,7 +162,9 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         side = side_of(base) if options.side_file is None else None
         if side is None:
             raise
-        raise DataError(f"{error} Beside it lies {side.path.name}: --from {side.path} takes it ({side}).") from error
+        raise DataError(
+            f"{error} Beside it lies {side.path.name}: --scanner-file {side.path} takes it ({side})."
+        ) from error
     except BaseException:
         base.close()
         raise
@@ -350,8 +352,8 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     """DataError for options that exclude each other."""
     own = ("angles", "darks", "flats", "data_path", "angles_path")
     replaced = [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
-    own_kinds = {"horizontal-axis": options.horizontal_axis, "frames": options.frames, "then": options.then}
-    replaced += [f"--{name}" for name, given in (own_kinds | {"from": options.side_file}).items() if given]
+    own_kinds = {"horizontal-axis": options.horizontal_axis, "frames": options.frames, "append": options.then}
+    replaced += [f"--{name}" for name, given in (own_kinds | {"scanner-file": options.side_file}).items() if given]
     if follow and replaced:
         raise DataError(
             f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "

@@ -167,7 +167,7 @@ def side_of(source: ScanSource) -> SideFile | None:
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
     """A sentence on what a vendor's file beside these images states."""
     side = side_of(source)
-    return () if side is None else (NotUsed(side.path.name, str(side), f"--from {side.path} takes it", True),)
+    return () if side is None else (NotUsed(side.path.name, str(side), f"--scanner-file {side.path} takes it", True),)
 
 
 def _candidates(scan: Path) -> Iterator[Path]:

@@ -215,7 +215,7 @@ class TiffSeriesSource(ScanSource):
             raise UnreadableError(f"{name} in {self.path} cannot be read as an image (it contains none).")
         if len(shape) != 2:
             raise DataError(
-                f"{name} in {self.path} is {shape}; expected one grey image a file. Give stacks as FILE --then FILE."
+                f"{name} in {self.path} is {shape}; expected one grey image a file. Give stacks as FILE --append FILE."
             )
         require_real(dtype, f"{name} in {self.path}")
         return shape
