@@ -112,7 +112,7 @@ def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | R
     if 0 < lost < data.size:
         warnings.warn(
             f"{lost} of {data.size} values of the projections are not finite: they are filled from their neighbours "
-            "and weigh nothing. Give DataUse(weights) of 0 there, where that is known",
+            "and weigh nothing. If you know which they are, give them the weight 0 in DataUse(weights)",
             stacklevel=3,
         )
 
@@ -123,8 +123,8 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
     if some.sum(dtype=np.float64) < -np.abs(some).sum(dtype=np.float64) / 2:
         warnings.warn(
             f"projections are below 0 for the most part (mean {some.mean(dtype=np.float64):.4g}). Line integrals of "
-            "matter are above 0, -log of the transmission: change the sign. Of differences of views, methods that keep "
-            "no voxel below 0 need allow_negative",
+            "matter are above 0, -log of the transmission: change the sign. For differences of views, set "
+            "allow_negative in methods that keep no voxel below 0",
             stacklevel=3,
         )
 

@@ -136,7 +136,8 @@ class _Lasting:
 
 
 class _Printable:
-    """A text stream that shows control characters instead of sending them, as names of files and texts in them hold.
+    """A text stream that shows the control characters of foreign names and texts instead of sending them to the
+    terminal.
 
     `unfiltered` is the stream itself, for a progress bar.
     """
@@ -152,8 +153,8 @@ class _Printable:
 
 
 def guard_streams() -> None:
-    """Put `sys.stdout` and `sys.stderr` on streams that last, and that get printable text. Both, and stdin, are open
-    from now on.
+    """Replace `sys.stdout` and `sys.stderr` by streams that outlive a closed terminal and print no control characters;
+    both, and stdin, are open from now on.
 
     The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
     """
@@ -178,7 +179,7 @@ def _nowhere() -> TextIO:
 
 
 def _command(name: str) -> CommandEntry | None:
-    """Other packages are asked, which takes a tenth of a second, only where the name is not ours."""
+    """The command of this name; other packages are searched (a tenth of a second) only if it is not ours."""
     return own_commands().get(name) or commands().get(name)
 
 

@@ -136,8 +136,9 @@ class BeamCheck(Logged):
 
 
 def in_air(context: ScanContext) -> float:
-    """Line integral of the brightest place of a view, as logarithm of the light lost since the flats; NaN where it may
-    be matter: more than COVERED, and not what air has shown so far."""
+    """Line integral of the brightest place of a view (light lost since the flats); NaN if it may be matter: above
+    COVERED, and unlike the air so far.
+    """
     if context.view is None or context.grid is None or not context.grid.flats:
         return math.nan
     brightest = brightest_place(context.view, context.grid)

@@ -31,8 +31,9 @@ NAMED = 4  # most shadows that are named
 
 @dataclass(frozen=True)
 class FieldState:
-    """Unlit flats were reported; a view had all matter inside; views in a row with matter at the edges; that was
-    reported."""
+    """Whether unlit flats were reported; whether a view held all matter; consecutive views with matter at the edges;
+    whether these were reported.
+    """
 
     unlit: bool = False
     inside: bool = False

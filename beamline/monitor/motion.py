@@ -32,8 +32,9 @@ SPREAD = 2.6  # standard deviation of the estimate for noise alone, over the var
 
 @dataclass(frozen=True)
 class Axis:
-    """One direction: the changes' usual size, the last one, and running means of squares, of products of those that
-    follow one another, and of variances by noise."""
+    """One direction of motion: usual and latest size of changes; running means of their squares, of products of
+    consecutive ones, and of noise variances.
+    """
 
     usual: FrameScatter = field(default_factory=FrameScatter)
     last: float = math.nan
@@ -54,7 +55,7 @@ class Axis:
         return Axis(usual, away, square, product, noise)
 
     def size(self, pairs: int) -> float:
-        """Standard deviation of x in pixels, without the part of the noise; 0 where noise alone may give as much.
+        """Size of the shake: standard deviation in pixels, less the noise; 0 if noise alone may explain it.
 
         The squares tell it more exactly than the products, where these confirm it.
         """

@@ -152,7 +152,7 @@ class OppositeCheck(Logged):
         return replace(looked, state=replace(looked.state, kept=(*state.kept[:at], one, *state.kept[at + 1 :])))
 
     def _unsure(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
-        """By how many pixels the extrapolation of a kept view by so many steps may err, see `Fit.unsure`.
+        """Largest likely error, px, of a kept view extrapolated by some steps, see `Fit.unsure`.
 
         A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
         differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that
@@ -190,7 +190,8 @@ class OppositeCheck(Logged):
             return CheckResult(state, flag)
         advice = (
             f"By frames {one.view.index} and {view.index}, from opposite sides, the axis is at column "
-            f"{axis:.1f}; the scan states {stated:.1f}. The axis is elsewhere, or the sample moved by twice as much."
+            f"{axis:.1f}; the scan states {stated:.1f}. The stated axis is wrong, or the sample moved by twice the "
+            "difference."
         )
         return CheckResult(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
 
@@ -218,7 +219,7 @@ class OppositeCheck(Logged):
 
 
 def _with_view(kept: tuple[Kept, ...], view: CellView, replaces: int, *, follows: bool) -> tuple[Kept, ...]:
-    """The views kept after the next one, which gives the last of them its velocity, or is kept itself."""
+    """The kept views after one more view, which gives the last of them its velocity, or is kept itself."""
     kept = tuple(one for one in kept if one.view.index != replaces)  # the replaced view had an alarm
     if kept and kept[-1].after is None:
         return (*kept[:-1], replace(kept[-1], after=view)) if follows else kept[:-1]

@@ -28,7 +28,7 @@ OF_SHALLOW = 1.2816  # standard deviations: SHALLOW percent of noise are further
 
 
 def flats_like_views(single: bool) -> Callable[[Evidence, Any], Iterator[BadFrames]]:
-    """The rule that flats differ less from a view than from other flats: each from those of its group, or groups."""
+    """Rule: flats that resemble a view more than other flats, each within its group, or by whole groups."""
     return partial(_like_views, single=single)
 
 

@@ -160,7 +160,7 @@ def _without_holes(digest: FrameDigest) -> FrameDigest:
 
 
 def _valid(answer: Any, name: str, at: int) -> CheckResult[Any]:
-    """What the check of this name returned at a frame. TypeError, ValueError: a scan cannot go on with it."""
+    """The result of a check, once it is known to be usable. Raises TypeError or ValueError for any other."""
     if not isinstance(answer, CheckResult) or type(answer.flag) not in (Flag, type(None)):
         raise TypeError(f"it returned {answer!r:.80}; expected a CheckResult with a Flag or None")
     if (flag := answer.flag) is None:

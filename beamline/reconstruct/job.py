@@ -286,7 +286,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
 
 
 def _of_preset(job: Job, result: Reconstruction) -> str:
-    """The lengths that a preset chose; without one, a warning where a fit could not have the number asked for."""
+    """Steps and Gaussians that a preset chose; without one, a warning if a fit could not have the number asked for."""
     method, started_from = job.method, result.started_from
     if not isinstance(method, FitMethod):
         return ""

@@ -358,7 +358,7 @@ class ScanFollower:
         return self._cursor.batches[0]
 
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
-        """All views, now that they are there, after the steps that need all of them."""
+        """All views, once recorded, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
         selection, projections = self._options.selection, self._joined()
         places = ViewGeometry(self.source, selection, axis_col)

@@ -177,7 +177,7 @@ class LiveSlices:
 
 
 def _coverage(unseen: Wedge | None, angles: NDArray[np.float64]) -> str:
-    """What a heading says where the views leave a wedge out."""
+    """The addition to a heading if the views leave a wedge out."""
     if unseen is None:
         return ""
     order = "sequential: " if one_way(angles) else ""

@@ -188,7 +188,7 @@ def _predicting_radius(views: F32, geometry: Geometry, reach: float) -> SampleRa
 
 
 def _factor(geometry: Geometry, columns: int) -> int:
-    """The binning that leaves at most so many columns."""
+    """The binning that leaves at most `columns` columns."""
     rows, cols = geometry.detector_shape
     return max(1, min(rows, math.ceil(cols / columns)))
 

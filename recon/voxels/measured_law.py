@@ -54,7 +54,8 @@ _CIRCLE = 0.95  # of the field's radius, where errors count
 def measured_law(
     data: F32, geometry: Geometry, views_at_ends: Sequence[int], rng: np.random.Generator, open_beam: F32
 ) -> tuple[ErrorLaw, float | None]:
-    """The law of the error of the volume of these views, and dB by those of the last pass (None: not known).
+    """The law of the error of the volume of these views, and the dB that the views of the last pass gained (None: not
+    known).
 
     Args:
         data: line integrals [view, row, col] in the order taken; finite.

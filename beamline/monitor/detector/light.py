@@ -84,7 +84,7 @@ class ZingersState:
 
 @dataclass(frozen=True)
 class ZingersCheck(Logged):
-    """Score: zingers of the frame over its pixels. Their number is said once, as a fact.
+    """Score: zingers of the frame over its pixels. Their number is reported once, as a fact.
 
     The default: at 1e-4 a slice 2000 pixels wide of as many views has 400 rays with one, each a streak if it stays.
     """

@@ -283,8 +283,8 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
 
 
 def _true_type(source: ScanSource) -> np.dtype[Any] | None:
-    """The real type of pixels that are bits of such, or the type without a sign of counts that wrapped, which holds all
-    of them; None: they are what they are stored as.
+    """The type that pixels really have: reals stored as whole numbers, or unsigned counts that wrapped, wide enough for
+    all of them; None: as stored.
     """
     if source.dtype.kind == "u":
         some = [each for each in _some_of_each_kind(source) if each.any()]
@@ -357,7 +357,7 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     if follow and replaced:
         raise DataError(
             f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "
-            "frames, and they still come."
+            "frames, and more are still to come."
         )
     for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
         if getattr(options, one) is not None and getattr(options, other) is not None:

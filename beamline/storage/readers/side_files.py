@@ -254,7 +254,7 @@ def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n:
 
 
 def _listed_angles(path: Path, n: int) -> NDArray[np.float64] | None:
-    """Degrees of each projection in the `_ctdata.txt` beside Nikon's file; None where it is not there or of others."""
+    """Degrees of each projection in `_ctdata.txt` beside Nikon's file; None if it is missing, or of another scan."""
     files = sorted(path.parent.glob("*_ctdata.txt"))
     if len(files) != 1:
         return None

@@ -116,7 +116,7 @@ def edge_motion(geometry: Geometry) -> float:
 
 
 def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: float) -> Geometry:
-    """The geometry after steps along `slopes`, limited to so many pixels; what nobody can know is left out."""
+    """The geometry after steps along `slopes`, of at most `farthest` pixels; what nobody can know is left out."""
     limited = {name: np.clip(step, -farthest, farthest) for name, step in steps.items()}
     shifts, axis = geometry.shifts.copy(), geometry.axis_col
     if "col" in limited:

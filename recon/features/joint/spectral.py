@@ -142,7 +142,7 @@ class _Trials:
         self._go_on, self._stop = go_on, stop
 
     def residual(self, weights: F64, after: int) -> float:
-        """Residual of the views held out, infinite if the trial was ended; `after` it so many trials may follow."""
+        """Residual of the views held out, infinite if the trial was stopped; `after`: trials that may still follow."""
         n = self._sweeps
         for sweep, residual in enumerate(self._fit.sweeps(weights, n), 1):
             if not self._go_on(sweep - n * (1 + after), residual):
