@@ -40,8 +40,8 @@ class StageFigures(CheckedSettings):
         ValueError: figures that no stage can have.
     """
 
-    simulated: ClassVar[bool] = True
-    """Whether a controller under simulators/wires takes these settings."""
+    stand_in: ClassVar[str] = ""
+    """The kind of stage that is simulated in the place of this one; "": this one has a simulated controller itself."""
     counts_per_turn: int = key(doc="Motor pulses or encoder counts for 360 deg; triggers fall on whole ones.", gt=0)
     max_speed: float = key(unit="deg_s", gt=0)
     acceleration: float = key(unit="deg_s2", gt=0)
@@ -116,6 +116,8 @@ class Wiring(CheckedSettings):
 
 class StageSettings(Protocol):
     """Settings of a driver, and the limits that follow from them: a dataclass on `StageFigures`."""
+
+    stand_in: ClassVar[str]
 
     @property
     def max_speed(self) -> float: ...

@@ -34,7 +34,7 @@ class ZaberSettings(Wiring, StageFigures):
             output can give, or triggers that cannot work together.
     """
 
-    simulated: ClassVar[bool] = False
+    stand_in: ClassVar[str] = "pi_gcs"  # its own controller is simulated in the tests
     device: int = key(1, ge=1, le=99)
     axis: int = key(1, ge=1, le=9)
     serial: str | None = key(None, "Its serial number (system.serial): another device is refused; null: any is taken.")

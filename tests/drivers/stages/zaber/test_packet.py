@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.stages.zaber.packet import ENDINGS, FAULTS, Reply, damage, encode, lrc, meaning_of, reply_form
-from simulators.wires.zaber.wire import frame
 from tests.drivers.zaber_vectors import VECTORS
+from tests.simulators.wires.zaber.wire import frame
 
 COMMANDS = [
     ("/1 0 01 trigger 1 when 1 dist 1000:C1", (1, 0, 1, "trigger 1 when 1 dist 1000")),

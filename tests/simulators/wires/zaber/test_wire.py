@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.zaber.triggers import Triggers
-from simulators.wires.zaber.wire import Command, Fault, PacketReader, ZaberBuild, frame, lrc
 from tests.drivers.stages.flat_settings import flat
 from tests.drivers.zaber_vectors import VECTORS
-from tests.simulators.zaber_host import SPEED, TURN, Wire
+from tests.simulators.wires.zaber.host import SPEED, TURN, Wire
+from tests.simulators.wires.zaber.triggers import Triggers
+from tests.simulators.wires.zaber.wire import Command, Fault, PacketReader, ZaberBuild, frame, lrc
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 from drivers.base.clock import Clock
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.zaber.axis import Rejected, SimulatedZaberAxis, ZaberAxisBuild
-from simulators.wires.zaber.triggers import ACTIONS, OUTPUTS, TRIGGERS, Edge, Triggers, is_output, number_in
+from tests.simulators.wires.zaber.axis import Rejected, SimulatedZaberAxis, ZaberAxisBuild
+from tests.simulators.wires.zaber.triggers import ACTIONS, OUTPUTS, TRIGGERS, Edge, Triggers, is_output, number_in
 
 LOOK_AHEAD = 10.0  # s beyond the end of a move for which edges are predicted
 WRITABLE = {"maxspeed", "motion.accelonly", "motion.decelonly", "limit.min", "limit.max"}

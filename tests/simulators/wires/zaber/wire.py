@@ -17,9 +17,9 @@ from drivers.base.clock import Clock
 from drivers.stages.zaber.settings import ZaberSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.wire import BytesWire
-from simulators.wires.zaber.axis import Rejected, ZaberAxisBuild
-from simulators.wires.zaber.device import NOTHING, DeviceBuild, ZaberDevice
-from simulators.wires.zaber.triggers import OUTPUTS
+from tests.simulators.wires.zaber.axis import Rejected, ZaberAxisBuild
+from tests.simulators.wires.zaber.device import NOTHING, DeviceBuild, ZaberDevice
+from tests.simulators.wires.zaber.triggers import OUTPUTS
 
 LONGEST_PACKET = 80  # Bytes of a packet; a longer one is ignored
 LONGEST_WORD = 50
