@@ -70,7 +70,7 @@ def measured_law(
     """
     n = len(data)
     if geometry.is_cone:
-        raise ValueError("the beam is a cone, of which no law of the error is measured")
+        raise ValueError("the law of the error is not measured for a cone beam")
     if n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
         raise ValueError(
             f"{n} views and {len(open_beam)} frames of the open beam are there, "

@@ -88,7 +88,7 @@ def knowable(shifts: F64, angles: F64) -> tuple[F64, float]:
 
 
 def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset[str]) -> dict[str, F32]:
-    """The derivative of images [view, col, row] by each quantity: a pixel; an image's half extent at its edge.
+    """The derivative of images [view, col, row] by each quantity, per step of a pixel (of angles: at an image's edge).
 
     Args:
         tilted: the derivative by tilt, a radian; None: not wanted.

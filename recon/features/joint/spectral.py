@@ -168,7 +168,7 @@ class _Trials:
         return best
 
     def heaviest(self, weights: F64, factor: F64, rungs: int, after: int) -> F64:
-        """The heaviest weights, times powers of the factor, that predict as well; `weights` if ended."""
+        """The heaviest weights, in powers of the factor, that predict as well as the best; `weights` if stopped."""
         ladder = [weights * factor**octave for octave in range(rungs)]
         residuals = [self.residual(rung, after + rungs - 1 - n) for n, rung in enumerate(ladder) if self.going]
         if not self.going:
