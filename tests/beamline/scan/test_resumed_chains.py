@@ -18,7 +18,7 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import Phase, settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from beamline.cli.main import main
 from beamline.core.errors import BeamlineError, DataError
@@ -39,6 +39,7 @@ from drivers.base.errors import DeviceError
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults, assert_true
 from tests.beamline.ran import killed, small
+from tests.slow_cases import others_slow
 
 FIRST = 5  # 3 darks and 2 flats
 VIEWS = 12
@@ -223,8 +224,8 @@ class PartsOfARun(RuleBasedStateMachine):
         try:
             with open_for_resume(self.run) as series:
                 assert sorted(series.views) == _views(self.run)
-        except (NothingMissing, NotJoined):
-            assert _views(self.run) == list(range(VIEWS))
+        except (NothingMissing, NotJoined) as ended:
+            assert _views(self.run) == list(range(VIEWS)) and isinstance(ended, NotJoined) is not self._is_joined()
         except NoFrame:
             assert _rows(self.run) == []
 
@@ -285,9 +286,13 @@ class PartsOfARun(RuleBasedStateMachine):
             kinds = [kind for kind, _ in _rows(self.run)[known:]]
             references = FIRST + 2 if missing else 2  # with the views all are taken, at last those of the end alone
             assert (kinds.count(FrameKind.PROJECTION), len(kinds)) == (missing, missing + references)
-        except (NotJoined, NothingMissing):
-            assert missing == 0
-            recover_run(self.run)
+        except NotJoined:
+            assert missing == 0 and not self._is_joined()
+            said = CliRunner().invoke(main, ["scan", "--resume", str(self.run)])
+            assert said.exit_code == 0, said.output
+        except NothingMissing:
+            assert missing == 0 and self._is_joined()
+        assert [kind for kind, _ in _rows(self.run)[-2:]] == [FrameKind.FLAT] * 2  # those of the end
         _assert_whole(self.joined if self.joined.exists() else self.run / "scan.h5")
         for file, digest in self.closed.items():
             assert _digest(file) == digest
@@ -302,6 +307,11 @@ class PartsOfARun(RuleBasedStateMachine):
     def joined(self) -> Path:
         return self.run / JOINED
 
+    def _is_joined(self) -> bool:
+        """There is one closed file of all frames."""
+        files = self._parts_with_frames()
+        return all(map(self._was_closed, files)) and (len(files) == 1 or is_joined(self.joined))
+
     def _parts_with_frames(self) -> list[Path]:
         return [part / "scan.h5" for part in parts_of(self.run) if parts.may_hold_frames(part / "scan.h5")]
 
@@ -314,15 +324,11 @@ class PartsOfARun(RuleBasedStateMachine):
         return True
 
 
-# Hypothesis draws the orders of a few steps here, and of many in slow tests.
-TestPartsOfARun = PartsOfARun.TestCase
-TestPartsOfARun.settings = settings(max_examples=3, stateful_step_count=4, deadline=None, phases=[Phase.generate])
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(1200)
-class TestManyPartsOfARun(PartsOfARun.TestCase):  # type: ignore[name-defined, misc]
-    settings = settings(max_examples=15, stateful_step_count=7, deadline=None, phases=[Phase.generate])
+@pytest.mark.parametrize(("runs", "steps"), others_slow([(3, 4), (15, 7)]))
+def test_any_order(runs: int, steps: int) -> None:
+    drawn = settings(max_examples=runs, stateful_step_count=steps, deadline=None, phases=[Phase.generate])
+    run_state_machine_as_test(PartsOfARun, settings=drawn)
 
 
 @pytest.mark.parametrize(
