@@ -201,7 +201,7 @@ class ShownScan:
         some = spread_views(self._source.table.angles[frames], _VIEWS, frames)
         band = range(max(near, 0), min(far + 1, rows))
         try:
-            self._correction = self._correction or ScanCorrection(self._source, Selection(), lambda _: None)
+            self._correction = self._correction or ScanCorrection(self._source, Selection(), lambda _: None, some)
             corrected = self._correction.at_once(some, slice(band.start, band.stop))
         except ValueError as error:
             raise DataError(f"The views cannot be corrected: {error}.") from error

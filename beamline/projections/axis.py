@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
-from beamline.projections.correction import ScanCorrection
+from beamline.projections.correction import ScanCorrection, line_integrals_of
 from beamline.projections.corrections.poses import poses_of, stated_poses
 from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned
 from beamline.projections.usable_views import UsableViews, longest_part
@@ -55,7 +55,9 @@ def rotation_axis(
         axis_col, axis = _axis_by_views(source, selection, usable, warn, progress)
     elif axis_col is None:
         whole = selection.axis_rows
-        by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
+        by = correction
+        if whole is not None:
+            by = ScanCorrection(source, replace(selection, rows=whole), lambda _: None, usable.frames)
         axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
     check_axis(source, axis_col)
     straight = not posed and cone_of(source, selection) is None
@@ -95,7 +97,7 @@ def _axis_by_views(
     poses, frames = poses_of(source, coarse, usable.frames), usable.frames
     if poses is not None:
         frames = frames[poses.stated(frames)]
-    views = ScanCorrection(source, coarse, lambda _: None).at_once(spread(frames, VIEWS))
+    views = line_integrals_of(source, coarse, spread(frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
     geometry = geometry_of(source, coarse, begin, source.table.angles[views.view_ids])
     if poses is not None:

@@ -27,12 +27,16 @@ from beamline.storage.rules.references import ReferenceGroups, groups_taken, ref
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
 from recon.base.views import spread
-from recon.prep.correct import Correction, CorrectionSettings, References
+from recon.prep.correct import CorrectionSettings, LinesPlan, References, survey
 from recon.prep.counts import Photons, photon_transfer
 from recon.prep.references import SHADOW_REACH, shadowed
 from recon.prep.unmeasured import foreign_rows
 
 _LEAST_VIEWS, SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least and at most, and rows at a time
+
+Shadow = tuple[Mask, Mask]
+"""bool [row, col], objects in the beam of all views; bool [row], rows in which objects come and go that are not of the
+sample (`foreign_rows`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,27 +102,8 @@ class OpenBeam:
         }
         return cls(references, settings, photons, light, n, used, done)
 
-    def correction(self, rows: slice, shadow: tuple[Mask, Mask] | None) -> Correction:
-        """The correction for some of the rows read, binned.
-
-        Args:
-            shadow: of all rows read, see `shadow`; None: nothing.
-
-        Raises:
-            ValueError: references that cannot be used.
-        """
-        references, settings = self.references.rows(rows), self.settings
-        standing, foreign = (None, None) if shadow is None else (part[rows] for part in shadow)
-        plain = Correction(references, settings, None, self.photons, foreign)
-        if standing is None or not standing.any():
-            return plain
-        return Correction(references, settings, plain.masked | standing, self.photons, foreign)
-
-    def shadow(
-        self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int
-    ) -> tuple[Mask, Mask] | None:
-        """bool [row, col], objects in the beam of all views, and bool [row], rows in which objects come and go that are
-        not of the sample (`foreign_rows`), judged from some of these; None if they are too few to tell.
+    def shadow(self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int) -> Shadow | None:
+        """What stands in the beam of all views, judged from some of these; None if they are too few to tell.
 
         Args:
             first: the detector row at which the rows read begin.
@@ -133,10 +118,20 @@ class OpenBeam:
             rows = slice(max(0, start - SHADOW_REACH), min(len(in_shadow), start + _BAND + SHADOW_REACH))
             read = slice(first + rows.start * binning, first + rows.stop * binning)
             data = np.nan_to_num(read_binned(source, views, read, binning))
-            light = Correction(references.rows(rows), settings).transmission(data, views.astype(np.float64)).data
+            light = survey(references.rows(rows), settings).transmission(data, views.astype(np.float64), views).data
             in_shadow[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
             foreign[rows] |= foreign_rows(light, source.table.angles[views])
         return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow, foreign
+
+
+def foreign_to_lines(source: ScanSource, views: NDArray[np.int64], read: slice, binning: int) -> Shadow | None:
+    """As `OpenBeam.shadow`, of line integrals, in which nothing tells what stands there in all views."""
+    if views.size < SHADOW_VIEWS:
+        return None
+    some = spread(views, SHADOW_VIEWS)
+    lines = LinesPlan.of(np.inf).transmission(read_binned(source, some, read, binning), some.astype(np.float64), some)
+    foreign = foreign_rows(np.exp(-lines.data), source.table.angles[some])
+    return np.zeros(lines.data.shape[1:], np.bool_), foreign
 
 
 def count_references(source: ScanSource) -> int:

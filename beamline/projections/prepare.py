@@ -14,12 +14,12 @@ from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
-from beamline.projections.correction import NoViewError, ScanCorrection
+from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import EstimatedStep, ScanStep
-from beamline.projections.read import ViewFilters
+from beamline.projections.read import NoViewError, ViewFilters
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.scan_warnings import (
     report_defects,
@@ -87,7 +87,7 @@ def prepare_projections(
     usable, poses, wide = _usable(source, selection, warn)
     phases.enter("tilt and references", "bands")
     selection, sought = with_tilt(source, selection, usable.frames, warn, phases.progress)
-    correction = ScanCorrection(source, selection, warn)
+    correction = ScanCorrection(source, selection, warn, usable.frames)
     if poses is None and selection.step(TiltAndLens).tilt is None and cone_of(source, selection) is None:
         warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
@@ -111,7 +111,7 @@ def prepare_projections(
         and (new := step.estimated(source, selection, projections, geometry)) is not None
     ]:
         selection = selection.with_steps(*estimated)
-        correction = ScanCorrection(source, selection, lambda _: None)  # its warnings were given
+        correction = ScanCorrection(source, selection, lambda _: None, usable.frames)  # its warnings were given
         if any(step.on(source, selection)[0] is not None for step in estimated):
             projections = _corrected(source, correction, used, buffer, phases)
     light = compare_with_flats(source, selection, projections, warn)

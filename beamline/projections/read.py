@@ -1,16 +1,16 @@
-"""Reading: pixels of a scan, binned while they are read, which frames cannot be used, and the filters of views."""
+"""Reading: pixels of a scan, binned while they are read, and the views that cannot be used; the filters of views."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.preparation import Preparation
@@ -18,9 +18,11 @@ from beamline.projections.protocols import ViewFilter, ViewStep
 from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, rows_of
 from beamline.projections.step import StepDone
+from beamline.projections.usable_views import gap_sentence
 from beamline.storage.datasets import HELD
 from beamline.storage.readers.base import ScanSource, read_known
-from recon.prep.correct import Projections
+from beamline.storage.rules.references import ViewLight
+from recon.prep.correct import Projections, References
 
 BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
 
@@ -171,3 +173,96 @@ class ViewFilters:
         above = min(reach, first // n)
         below = min(reach, (self.height - end) // n)
         return slice(first - above * n, end + below * n), slice(above, above + (end - first) // n)
+
+
+class NoViewError(DataError):
+    """None of the requested views can be used."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewReader:
+    """Reads the views of one scan that can be used, and says of the others why they cannot.
+
+    Attributes:
+        selection: what is done with frames that differ from their checksums.
+        filters: rows and binning.
+        light: of whole views beside the flats.
+        references: of the rows that are read, binned; None: the frames are line integrals.
+        named: views without light that were named.
+    """
+
+    source: ScanSource
+    selection: Selection
+    filters: ViewFilters
+    light: ViewLight
+    references: References | None
+    warn: Warn
+    named: set[int] = field(default_factory=set)
+
+    def read(
+        self,
+        frames: NDArray[np.int64],
+        rows: slice | None,
+        progress: Callable[[int, int], None] = lambda n, total: None,
+    ) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Pixels [frame, row, col] of the frames that hold a finite one, have light and are not damaged, and these
+        frames; of some binned rows, of all for None."""
+        data = read_binned(self.source, frames, self.filters.read(rows), self.filters.binning, progress)
+        lost = tell_damaged(self.source, self.selection, frames, self.warn)
+        data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
+        alive = np.isfinite(data).any(axis=(1, 2))
+        if not alive.all():
+            dark = frames[~alive]
+            if rows is None:  # in a band it says nothing of the views
+                self.warn(
+                    f"{dark.size} of {self.source.table.views.size} views hold no finite pixel (first: frame "
+                    f"{dark[0]}): left out."
+                )
+            data, frames = data[alive], frames[alive]
+        lit, part, used = np.ones(len(frames), np.bool_), self.filters.within(rows), self.references
+        references = (None, None) if used is None else (used.dark[part], used.flats[0][1][part])
+        for at in np.flatnonzero(self.light.suspect(data, *references)):
+            lit[at] = not self.light.unlit(int(frames[at]))
+        if not lit.all():
+            data, frames = data[lit], frames[lit]
+        if rows is None and used is not None:
+            self._warn_of_copies(data, frames)
+        return data, frames
+
+    def _warn_of_copies(self, data: NDArray[Any], frames: NDArray[np.int64]) -> None:
+        """Warn of views that equal the one before pixel by pixel: no camera takes the same counts twice."""
+        middle = data.shape[1] // 2
+        alike = np.flatnonzero((data[1:, middle] == data[:-1, middle]).all(axis=1))  # soon tells most of them apart
+        copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
+        if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
+            self.warn(
+                f"{count(len(copies), 'view')} of {self.source.table.views.size} (frames {spans(copies)}) hold the "
+                "pixels of the view before: the camera or its driver gave an image twice. Their angles are then wrong "
+                "for what they show: leave them out with --views or --flags judge, or repeat them."
+            )
+
+    def tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
+        """Name the views without light among those asked for, once, and the gap that they leave."""
+        unlit = np.array([row for row in asked.tolist() if self.light.known.get(row) is False], np.int64)
+        if (news := np.setdiff1d(unlit, sorted(self.named))).size == 0:
+            return
+        gap = f", and{gap_text}" if (gap_text := gap_sentence(self.source, asked, lit)) else ""
+        self.named.update(news.tolist())
+        self.warn(
+            f"{count(news.size, 'view')} of {self.source.table.views.size} (frames {spans(news.tolist())}) have no "
+            "light: the shutter was closed, the beam was gone, or the file was never written there. They are left "
+            f"out{gap}."
+        )
+
+    def no_view(self) -> NoViewError:
+        """The error where none of the views can be used."""
+        beside_flats = (
+            ""
+            if self.light.flat is None
+            else f" The brightest have {self.light.usual:.2g} of the flats' light. Where views were divided by their "
+            "flats already, say --quantity transmission, or line-integrals."
+        )
+        return NoViewError(
+            f"{self.source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have no "
+            f"light, or differ from their checksums.{beside_flats}"
+        )

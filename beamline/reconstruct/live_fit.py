@@ -252,9 +252,9 @@ class ScanFollower:
         if gone:
             why = f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it unlearns them"
         self._sink(StateEntered("correcting", why, time=self._clock.now()))
-        self._correction = self._correction.renewed()
         self._cursor = replace(self._cursor, batches=())  # not both in memory
-        again = self._correction.at_once(np.union1d(frames, wide))
+        self._correction = self._correction.renewed(every := np.union1d(frames, wide))
+        again = self._correction.at_once(every)
         self._cursor = replace(self._cursor, batches=(again,))
         ordinary = again.data[~np.isin(again.view_ids, wide)] if wide.size else again.data
         self._fit.replace_views(ordinary, kept if gone else None)

@@ -219,7 +219,8 @@ def _refined(
     rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
     tilt = 0.0
     for n in range(_ROUNDS):
-        levelled = ScanCorrection(source, plain.with_steps(replace(step, tilt=math.degrees(tilt))), lambda _: None)
+        turned = plain.with_steps(replace(step, tilt=math.degrees(tilt)))
+        levelled = ScanCorrection(source, turned, lambda _: None, frames)
         residual = shown_tilt(
             source, levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress)
         )

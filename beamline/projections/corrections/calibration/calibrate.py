@@ -184,12 +184,12 @@ def calibrated(
     Raises:
         DataError: too few views, or nothing in the beam.
     """
-    from beamline.projections.correction import ScanCorrection
+    from beamline.projections.correction import line_integrals_of
     from recon.base.masks import areas
     from recon.features.calibration.learn import learn_geometry
 
     band = _band(source, selection)
-    views = ScanCorrection(source, band, lambda _: None).at_once(frames)
+    views = line_integrals_of(source, band, frames)
     ids = views.view_ids
     before = geometry_before(band, ids)
     lit = ~areas(views.masked)

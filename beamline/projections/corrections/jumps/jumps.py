@@ -178,7 +178,7 @@ class _CoarseViews:
 
     def clearness(self, frames: I64, part: I64) -> float:
         """How clearly the sample stood elsewhere in one of two parts [view] of these rows; 1 is the limit."""
-        from beamline.projections.correction import ScanCorrection
+        from beamline.projections.correction import line_integrals_of
         from recon.base.masks import areas
         from recon.voxels.displacement import Displacement, displacements, judge
 
@@ -188,7 +188,7 @@ class _CoarseViews:
         moves: list[Displacement] | None = None
         for cols, rounds in _LEVELS:
             band = self.band(cols)
-            views = ScanCorrection(self.source, band, lambda _: None).at_once(frames[looked])
+            views = line_integrals_of(self.source, band, frames[looked])
             geometry = geometry_of(self.source, band, self.axis_col, self.source.table.angles[views.view_ids])
             group = part[np.searchsorted(frames, views.view_ids)]
             seen = views.data, geometry, group, ~areas(views.masked)
