@@ -22,7 +22,7 @@ from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import gap_sentence
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import ViewLight, usual_exposure
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import altered_sentence
 from recon.base.arrays import Mask
 from recon.base.views import spread
@@ -54,7 +54,7 @@ class ScanCorrection:
     not. Then `renewed` corrects by what is known now.
     """
 
-    def __init__(self, source: ScanSource, selection: Selection, warn: Warn) -> None:
+    def __init__(self, scan: ScanEvidence, selection: Selection, warn: Warn) -> None:
         """Read the reference frames that the scan has; groups with a fault only where no other is left.
 
         Raises:
@@ -62,24 +62,24 @@ class ScanCorrection:
                 without the counts of a photon.
             DataError: references that cannot be used.
         """
+        source = scan.source
         self._filters = ViewFilters.of(source, selection)
         self.rows, self.binning = self._filters.rows, selection.binning
         if self._filters.filters:
             selection = selection.with_steps(replace(selection.step(Preparation), noise="log", gain=None))
-        self._source, self._selection, self._warn = source, selection, warn
+        self._scan, self._source, self._selection, self._warn = scan, source, selection, warn
         if source.table.altered.any():
             warn(altered_sentence(source))
         self._beam: OpenBeam | None = None
         self._shadow: tuple[Mask, Mask] | None = None  # as of `OpenBeam.shadow`; None: not looked for
         self._fed_by: tuple[Mask, Mask] | None = None  # that which `feed` corrects for
         if source.quantity == "counts":
-            self._beam = OpenBeam.of(source, selection, self._filters.read(None), self.rows, warn)
+            self._beam = OpenBeam.of(scan, selection, self._filters.read(None), self.rows, warn)
         elif selection.step(Preparation).noise == "counts":
             raise ConfigError(f"--noise counts: {source.path} contains line integrals, not counts. Leave it out.")
         elif selection.step(Preparation).by_current:
-            current_scale(source)  # refuses a file without any
+            current_scale(scan)  # refuses a file without any
         self._named_unlit: set[int] = set()  # views without light that were named
-        self._light = ViewLight.of(source, None if self._beam is None else self._beam.used)
         self._stream: Correction | LineIntegralCorrection | None = None
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
         self._fed = np.zeros(0, np.int64)
@@ -210,8 +210,8 @@ class ScanCorrection:
         """
         if self._beam is None:
             return np.zeros((0, 0, 0), np.float32)
-        flats = self._beam.used.flats[-1][:most]
-        exposures = float(np.median(self._source.table.exposures[flats])) / usual_exposure(self._source)
+        flats = self._scan.used.flats[-1][:most]
+        exposures = float(np.median(self._source.table.exposures[flats])) / self._scan.usual_exposure
         return self.quiet().at_once(flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
 
     @property
@@ -247,7 +247,7 @@ class ScanCorrection:
 
     def renewed(self) -> ScanCorrection:
         """A correction of the same views with all references recorded by now."""
-        return ScanCorrection(self._source, self._selection, self._warn)
+        return ScanCorrection(self._scan.renewed(), self._selection, self._warn)
 
     def _read(
         self,
@@ -270,9 +270,9 @@ class ScanCorrection:
             data, frames = data[alive], frames[alive]
         lit = np.ones(len(frames), np.bool_)
         part, beam = self._filters.within(rows), self._beam
-        references = (None, None) if beam is None else (beam.references.dark[part], beam.references.flats[0][1][part])
-        for at in np.flatnonzero(self._light.suspect(data, *references)):
-            lit[at] = not self._light.unlit(int(frames[at]))
+        references = None if beam is None else (beam.references.dark[part], beam.references.flats[0][1][part])
+        for at in np.flatnonzero(self._scan.suspect(data, references)):
+            lit[at] = not self._scan.unlit(int(frames[at]))
         if not lit.all():
             data, frames = data[lit], frames[lit]
         if rows is None and self._beam is not None:
@@ -294,9 +294,9 @@ class ScanCorrection:
     def _no_view(self) -> NoViewError:
         beside_flats = (
             ""
-            if self._light.flat is None
-            else f" The brightest have {self._light.usual:.2g} of the flats' light. Where views were divided by their "
-            "flats already, say --quantity transmission, or line-integrals."
+            if self._beam is None
+            else f" The brightest have {self._scan.brightest:.2g} of the flats' light. Where views were divided by "
+            "their flats already, say --quantity transmission, or line-integrals."
         )
         return NoViewError(
             f"{self._source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have no "
@@ -305,7 +305,7 @@ class ScanCorrection:
 
     def _tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
         """Name the views without light among those asked for, once, and the gap that they leave."""
-        unlit = np.array([row for row in asked.tolist() if self._light.known.get(row) is False], np.int64)
+        unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(self._scan.known_unlit, np.int64))
         if (news := np.setdiff1d(unlit, sorted(self._named_unlit))).size == 0:
             return
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self._source, asked, lit)) else ""
