@@ -17,6 +17,7 @@ from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.selection import Selection, cone_of, geometry_of
 from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.volumes.base import bare_record
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -201,7 +202,9 @@ class ShownScan:
         some = spread_views(self._source.table.angles[frames], _VIEWS, frames)
         band = range(max(near, 0), min(far + 1, rows))
         try:
-            self._correction = self._correction or ScanCorrection(self._source, Selection(), lambda _: None, some)
+            self._correction = self._correction or ScanCorrection(
+                ScanEvidence.of(self._source), Selection(), lambda _: None, some
+            )
             corrected = self._correction.at_once(some, slice(band.start, band.stop))
         except ValueError as error:
             raise DataError(f"The views cannot be corrected: {error}.") from error

@@ -16,6 +16,7 @@ from beamline.projections.corrections.poses import poses_of, stated_poses
 from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned
 from beamline.projections.usable_views import UsableViews, longest_part
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.axis_held_out import COLS, VIEWS, axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
@@ -34,7 +35,7 @@ _GUESSED = 0.01  # of the mass in filled pixels moves the centre of mass by at m
 
 
 def rotation_axis(
-    source: ScanSource,
+    scan: ScanEvidence,
     selection: Selection,
     correction: ScanCorrection,
     usable: UsableViews,
@@ -47,17 +48,17 @@ def rotation_axis(
         DataError: no axis explains the views.
         ConfigError: it lies outside the detector.
     """
-    axis_col, axis = selection.axis_col, None
+    source, axis_col, axis = scan.source, selection.axis_col, None
     if (stated := poses_of(source, selection, usable.frames)) is not None and stated.vectors is not None:
         return stated.axis_col, None
     posed = stated_poses(source, selection) is not None  # opposite views are then no mirror images
     if axis_col is None and (posed or cone_of(source, selection) is not None):
-        axis_col, axis = _axis_by_views(source, selection, usable, warn, progress)
+        axis_col, axis = _axis_by_views(scan, selection, usable, warn, progress)
     elif axis_col is None:
         whole = selection.axis_rows
         by = correction
         if whole is not None:
-            by = ScanCorrection(source, replace(selection, rows=whole), lambda _: None, usable.frames)
+            by = ScanCorrection(scan, replace(selection, rows=whole), lambda _: None, usable.frames)
         axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
     check_axis(source, axis_col)
     straight = not posed and cone_of(source, selection) is None
@@ -82,10 +83,10 @@ def _compare_with_views(
 
 
 def _axis_by_views(
-    source: ScanSource, selection: Selection, usable: UsableViews, warn: Warn, progress: Callable[[int, int], None]
+    scan: ScanEvidence, selection: Selection, usable: UsableViews, warn: Warn, progress: Callable[[int, int], None]
 ) -> tuple[float, AxisEstimate | None]:
     """The axis by views held out. What the file states stays, unless they agree better with another one."""
-    stated, cols = source.axis_col, source.shape[1]
+    source, stated, cols = scan.source, scan.source.axis_col, scan.source.shape[1]
     if selection.axis_rows is not None:
         selection = replace(selection, rows=selection.axis_rows)
     rows = rows_of(source, selection)
@@ -97,7 +98,7 @@ def _axis_by_views(
     poses, frames = poses_of(source, coarse, usable.frames), usable.frames
     if poses is not None:
         frames = frames[poses.stated(frames)]
-    views = line_integrals_of(source, coarse, spread(frames, VIEWS))
+    views = line_integrals_of(scan, coarse, spread(frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
     geometry = geometry_of(source, coarse, begin, source.table.angles[views.view_ids])
     if poses is not None:

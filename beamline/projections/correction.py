@@ -22,7 +22,7 @@ from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import ViewLight, usual_exposure
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import altered_sentence
 from recon.prep import correct
 from recon.prep.correct import (
@@ -49,14 +49,12 @@ class ScanPlan:
         filters: of views, with the rows and the binning.
         beam: the open beam; None: the frames are line integrals.
         preparation: of the selection; logarithms where filters mix pixels.
-        light: of whole views beside the flats.
         shadow: what stands in the beam of all views; None: not looked for.
     """
 
     filters: ViewFilters
     beam: OpenBeam | None
     preparation: Preparation
-    light: ViewLight
     shadow: Shadow | None = None
 
     @property
@@ -96,7 +94,7 @@ class ScanPlan:
             return replace(self, shadow=self.beam.shadow(source, views, read.start, n))
 
 
-def survey(source: ScanSource, selection: Selection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS) -> ScanPlan:
+def survey(scan: ScanEvidence, selection: Selection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS) -> ScanPlan:
     """Read the reference frames that the scan has, and of a finished scan some views.
 
     Groups of references with a fault are used only where no other is left.
@@ -109,19 +107,20 @@ def survey(source: ScanSource, selection: Selection, warn: Warn, views: NDArray[
             without the counts of a photon.
         DataError: references that cannot be used.
     """
-    filters, beam = ViewFilters.of(source, selection), None
+    source, beam = scan.source, None
+    filters = ViewFilters.of(source, selection)
     if filters.filters:
         selection = selection.with_steps(replace(selection.step(Preparation), noise="log", gain=None))
     asked = selection.step(Preparation)
     if source.table.altered.any():
         warn(altered_sentence(source))
     if source.quantity == "counts":
-        beam = OpenBeam.of(source, selection, filters.read(None), filters.rows, warn)
+        beam = OpenBeam.of(scan, selection, filters.read(None), filters.rows, warn)
     elif asked.noise == "counts":
         raise ConfigError(f"--noise counts: {source.path} contains line integrals, not counts. Leave it out.")
     elif asked.by_current:
-        current_scale(source)  # refuses a file without any
-    plan = ScanPlan(filters, beam, asked, ViewLight.of(source, None if beam is None else beam.used))
+        current_scale(scan)  # refuses a file without any
+    plan = ScanPlan(filters, beam, asked)
     return plan.in_shadow(source, views) if views.size else plan
 
 
@@ -147,14 +146,14 @@ class ScanCorrection:
     """
 
     def __init__(
-        self, source: ScanSource, selection: Selection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
+        self, scan: ScanEvidence, selection: Selection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
     ) -> None:
         """Survey the scan; arguments and errors are those of `survey`."""
-        self.plan = survey(source, selection, warn, views)
+        self.plan = survey(scan, selection, warn, views)
         self.rows, self.binning = self.plan.filters.rows, selection.binning
-        self._source, self._selection = source, selection
+        self._scan, self._source, self._selection = scan, scan.source, selection
         references = None if self.plan.beam is None else self.plan.beam.references
-        self._reader = ViewReader(source, selection, self.plan.filters, self.plan.light, references, warn)
+        self._reader = ViewReader(scan, selection, self.plan.filters, references, warn)
         self._stream: CorrectionPlan | LinesPlan | None = None  # with the views fed so far
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
         self._fed = NO_VIEWS
@@ -304,8 +303,8 @@ class ScanCorrection:
         """
         if self.plan.beam is None:
             return np.zeros((0, 0, 0), np.float32)
-        flats = self.plan.beam.used.flats[-1][:most]
-        exposures = float(np.median(self._source.table.exposures[flats])) / usual_exposure(self._source)
+        flats = self._scan.used.flats[-1][:most]
+        exposures = float(np.median(self._source.table.exposures[flats])) / self._scan.usual_exposure
         return self.quiet().at_once(flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
 
     @property
@@ -334,7 +333,7 @@ class ScanCorrection:
 
     def renewed(self, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorrection:
         """A correction with all references recorded by now; `views` as of `survey`."""
-        return ScanCorrection(self._source, self._selection, self._reader.warn, views)
+        return ScanCorrection(self._scan.renewed(), self._selection, self._reader.warn, views)
 
     def _refused(self) -> AbstractContextManager[None]:
         judged = self.plan.preparation.judged
@@ -344,13 +343,13 @@ class ScanCorrection:
 _NOTHING = np.empty((0, 0, 0), np.float32), NO_VIEWS
 
 
-def line_integrals_of(source: ScanSource, selection: Selection, frames: NDArray[np.int64]) -> Projections:
+def line_integrals_of(scan: ScanEvidence, selection: Selection, frames: NDArray[np.int64]) -> Projections:
     """Line integrals of some frames of a finished scan, corrected for themselves and without a warning.
 
     Raises:
         ConfigError, DataError: as of `survey` and `ScanCorrection.at_once`.
     """
-    return ScanCorrection(source, selection, lambda sentence: None, frames).at_once(frames)
+    return ScanCorrection(scan, selection, lambda sentence: None, frames).at_once(frames)
 
 
 def _by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:

@@ -23,7 +23,7 @@ from beamline.projections.read import read_binned, spoilt_frames, tell_damaged
 from beamline.projections.selection import Selection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups, views_differ
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
 from recon.base.views import spread
@@ -50,7 +50,6 @@ class OpenBeam:
         light: float64 [frame], by how much that of a view grows to the usual exposure and, where it is asked for, the
             median ring current; None: all views are alike.
         n_references: darks and flats that the file had.
-        used: those that are used.
         done: what flats, defects and noise came to, by these names.
     """
 
@@ -59,11 +58,10 @@ class OpenBeam:
     photons: Photons | None
     light: NDArray[np.float64] | None
     n_references: int
-    used: ReferenceGroups
     done: dict[str, StepDone]
 
     @classmethod
-    def of(cls, source: ScanSource, selection: Selection, read: slice, rows: slice, warn: Warn) -> OpenBeam:
+    def of(cls, scan: ScanEvidence, selection: Selection, read: slice, rows: slice, warn: Warn) -> OpenBeam:
         """The open beam from the reference frames in the file; a faulty group is used only if there is no other.
 
         Args:
@@ -76,15 +74,14 @@ class OpenBeam:
             DataError: references that cannot be used.
         """
         asked = selection.step(Preparation)
-        alike = not (asked.by_current or views_differ(source))
-        light, n = None if alike else light_scale(source, asked.by_current), count_references(source)
-        used = groups_taken(source) if asked.accepted else reference_groups(source)
-        references = read_references(source, used, read, selection, warn)
+        alike = not (asked.by_current or scan.views_differ)
+        light, n = None if alike else light_scale(scan, asked.by_current), count_references(scan.source)
+        references = read_references(scan, read, selection, warn)
         if asked.flat_fields == "dynamic":
-            references = with_dynamic_flats(source, used, references, read, selection)
-        tell_damaged(source, selection, np.concatenate([*used.darks, *used.flats]), warn)
-        warn_of_parts_without_flats(source, references, warn)
-        photons = photons_of(source, used, references, rows, selection)
+            references = with_dynamic_flats(scan, references, read, selection)
+        tell_damaged(scan.source, selection, np.concatenate([*scan.used.darks, *scan.used.flats]), warn)
+        warn_of_parts_without_flats(scan, references, warn)
+        photons = photons_of(scan, references, rows, selection)
         settings = CorrectionSettings(
             asked.floor,
             asked.hot_threshold,
@@ -92,7 +89,7 @@ class OpenBeam:
             selection.step(Air).columns,
             selection.step(Air).sample_from,
         )
-        flats, noise = flats_sentence(source, references, asked.by_current), noise_sentence(references, photons)
+        flats, noise = flats_sentence(scan, references, asked.by_current), noise_sentence(references, photons)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
         del recorded["sample_from"]  # follows from --air
         done = {
@@ -100,7 +97,7 @@ class OpenBeam:
             "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
             "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
         }
-        return cls(references, settings, photons, light, n, used, done)
+        return cls(references, settings, photons, light, n, done)
 
     def shadow(self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int) -> Shadow | None:
         """What stands in the beam of all views, judged from some of these; None if they are too few to tell.
@@ -143,9 +140,7 @@ _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's 
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
 
 
-def photons_of(
-    source: ScanSource, used: ReferenceGroups, references: References, rows: slice, selection: Selection
-) -> Photons | None:
+def photons_of(scan: ScanEvidence, references: References, rows: slice, selection: Selection) -> Photons | None:
     """Photon statistics of the (binned) pixels of a scan; None if logarithms are to be taken.
 
     The gain is that of the selection, or the photon transfer of the largest group of flats. The readout noise is that
@@ -158,13 +153,13 @@ def photons_of(
     model = selection.step(Preparation)
     if model.noise == "log":
         return None
-    binning = selection.binning
+    source, binning = scan.source, selection.binning
     first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
     middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
     spoilt = spoilt_frames(source, not model.uses_flags)
     flats, darks = (
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
-        for groups in (used.flats, used.darks)
+        for groups in (scan.used.flats, scan.used.darks)
     )
     if model.gain is not None:  # a mean of n pixels has n times as many photons a count
         light = _counts_of_light(references) * binning**2 / model.gain

@@ -31,8 +31,9 @@ from beamline.projections.scan_warnings import (
 from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, checked_views
+from beamline.projections.views import ViewGeometry, checked_views, evidence_of
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
@@ -65,6 +66,7 @@ def prepare_projections(
     buffer: DiskBuffer | None = None,
     check: Callable[[Geometry], object] | None = None,
     phases: Phases | None = None,
+    known: ScanEvidence | None = None,
 ) -> PreparedProjections:
     """Read, correct and align the views of `selection`.
 
@@ -77,6 +79,7 @@ def prepare_projections(
         check: raises what is wrong with the geometry of the views, as soon as the axis is known: before they are
             corrected.
         phases: takes the name of each phase as it begins.
+        known: of this scan, from an earlier preparation: frames that were looked at are not read again.
 
     Raises:
         DataError: the scan cannot be reconstructed; the message says why and what to do.
@@ -84,17 +87,18 @@ def prepare_projections(
     """
     phases = phases or Phases()
     phases.enter("flags and references")
-    usable, poses, wide = _usable(source, selection, warn)
+    scan = evidence_of(source, selection, known)
+    usable, poses, wide = _usable(scan, selection, warn)
     phases.enter("tilt and references", "bands")
-    selection, sought = with_tilt(source, selection, usable.frames, warn, phases.progress)
-    correction = ScanCorrection(source, selection, warn, usable.frames)
+    selection, sought = with_tilt(scan, selection, usable.frames, warn, phases.progress)
+    correction = ScanCorrection(scan, selection, warn, usable.frames)
     if poses is None and selection.step(TiltAndLens).tilt is None and cone_of(source, selection) is None:
         warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
-    axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
+    axis_col, axis = rotation_axis(scan, selection, correction, usable, warn, phases.progress)
     warn_of_other_axis(source, selection, axis_col, warn)
     phases.enter("jumps", "guesses")
-    view_geometry = ViewGeometry(source, selection, axis_col)
+    view_geometry = ViewGeometry(scan, selection, axis_col)
     usable = view_geometry.find_motion(usable, warn, phases)
     used, others = _chosen(view_geometry, usable, poses)
     view_geometry.calibrate(np.union1d(used, others), phases)
@@ -111,13 +115,13 @@ def prepare_projections(
         and (new := step.estimated(source, selection, projections, geometry)) is not None
     ]:
         selection = selection.with_steps(*estimated)
-        correction = ScanCorrection(source, selection, lambda _: None, usable.frames)  # its warnings were given
+        correction = ScanCorrection(scan, selection, lambda _: None, usable.frames)  # its warnings were given
         if any(step.on(source, selection)[0] is not None for step in estimated):
             projections = _corrected(source, correction, used, buffer, phases)
-    light = compare_with_flats(source, selection, projections, warn)
+    light = compare_with_flats(scan, selection, projections, warn)
     phases.enter("background, rings, views held out, hardening", "corrections")
     place = view_geometry.axis_col, axis
-    prepared = assemble(source, selection, projections, geometry, place, usable, warn, buffer is not None)
+    prepared = assemble(scan, selection, projections, geometry, place, usable, warn, buffer is not None)
     prepared = _with_held_out(prepared, correction, view_geometry, others)
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
     prepared = replace(prepared, done={**correction.done, **tilt, **view_geometry.done})
@@ -145,13 +149,14 @@ def _with_held_out(
 
 def require_usable(source: ScanSource, selection: Selection) -> None:
     """Raise the errors of `prepare_projections` that can be found without reading a frame."""
-    _usable(source, selection, lambda sentence: None)
+    _usable(evidence_of(source, selection), selection, lambda sentence: None)
 
 
-def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
+def _usable(scan: ScanEvidence, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
     """The usable views, their stated poses, and rows of wide views; refuses what is wrong before any frame is read."""
+    source = scan.source
     warn_of_joined_views(source, warn)
-    usable = checked_views(source, selection, warn)
+    usable = checked_views(scan, selection, warn)
     warn_of_units(source, selection, warn)
     first = choose_views(source, usable.frames, selection)
     for step in geometry_steps(selection):
@@ -168,7 +173,7 @@ def _chosen(
     view_geometry: ViewGeometry, usable: UsableViews, poses: ScanPoses | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows of the file of the views that are used, and of some others that are held out."""
-    source, selection, frames = view_geometry.source, view_geometry.selection, usable.frames
+    source, selection, frames = view_geometry.scan.source, view_geometry.selection, usable.frames
     chosen = choose_views(source, frames, selection, view_geometry.of(frames).period)
     used, rest = frames[chosen], np.delete(frames, chosen)
     if poses is not None:
@@ -229,7 +234,7 @@ def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
 
 
 def assemble(
-    source: ScanSource,
+    scan: ScanEvidence,
     selection: Selection,
     projections: Projections,
     geometry: Geometry,
@@ -249,7 +254,8 @@ def assemble(
     Raises:
         DataError: fewer than two views, or nothing in the beam.
     """
-    rows, (height, width) = rows_of(source, selection), geometry.detector_shape
+    source, (height, width) = scan.source, geometry.detector_shape
+    rows = rows_of(source, selection)
     binning, first = selection.binning, ViewFilters.of(source, selection).read(None).start
     ids = projections.view_ids
     if ids.size < 2:
@@ -286,7 +292,7 @@ def assemble(
         sample_radius=_stated_radius(source, selection),
     )
     report_defects(prepared, first, binning, warn)
-    warn_of_the_field(source, selection, prepared.ordinary, warn)
+    warn_of_the_field(scan, selection, prepared.ordinary, warn)
     return prepared
 
 

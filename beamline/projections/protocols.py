@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from beamline.projections.selection import Selection
     from beamline.projections.usable_views import UsableViews
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.geometry import Geometry
     from recon.prep.correct import Projections
 
@@ -141,7 +142,7 @@ class PlaceStep(PrepStep, Protocol):
 
     def place(
         self,
-        source: ScanSource,
+        scan: ScanEvidence,
         selection: Selection,
         usable: UsableViews,
         axis_col: float,
@@ -205,7 +206,7 @@ class GeometryStep(PrepStep, Protocol):
 
     def learn(
         self,
-        source: ScanSource,
+        scan: ScanEvidence,
         selection: Selection,
         frames: NDArray[np.int64],
         geometry_before: Callable[[Selection, NDArray[np.int64]], Geometry],

@@ -21,7 +21,7 @@ from beamline.projections.step import StepDone
 from beamline.projections.usable_views import gap_sentence
 from beamline.storage.datasets import HELD
 from beamline.storage.readers.base import ScanSource, read_known
-from beamline.storage.rules.references import ViewLight
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.prep.correct import Projections, References
 
 BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
@@ -186,18 +186,21 @@ class ViewReader:
     Attributes:
         selection: what is done with frames that differ from their checksums.
         filters: rows and binning.
-        light: of whole views beside the flats.
         references: of the rows that are read, binned; None: the frames are line integrals.
         named: views without light that were named.
     """
 
-    source: ScanSource
+    scan: ScanEvidence
     selection: Selection
     filters: ViewFilters
-    light: ViewLight
     references: References | None
     warn: Warn
     named: set[int] = field(default_factory=set)
+
+    @property
+    def source(self) -> ScanSource:
+        """What reads the frames."""
+        return self.scan.source
 
     def read(
         self,
@@ -207,22 +210,23 @@ class ViewReader:
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Pixels [frame, row, col] of the frames that hold a finite one, have light and are not damaged, and these
         frames; of some binned rows, of all for None."""
-        data = read_binned(self.source, frames, self.filters.read(rows), self.filters.binning, progress)
-        lost = tell_damaged(self.source, self.selection, frames, self.warn)
+        source = self.source
+        data = read_binned(source, frames, self.filters.read(rows), self.filters.binning, progress)
+        lost = tell_damaged(source, self.selection, frames, self.warn)
         data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
         alive = np.isfinite(data).any(axis=(1, 2))
         if not alive.all():
             dark = frames[~alive]
             if rows is None:  # in a band it says nothing of the views
                 self.warn(
-                    f"{dark.size} of {self.source.table.views.size} views hold no finite pixel (first: frame "
+                    f"{dark.size} of {source.table.views.size} views hold no finite pixel (first: frame "
                     f"{dark[0]}): left out."
                 )
             data, frames = data[alive], frames[alive]
         lit, part, used = np.ones(len(frames), np.bool_), self.filters.within(rows), self.references
-        references = (None, None) if used is None else (used.dark[part], used.flats[0][1][part])
-        for at in np.flatnonzero(self.light.suspect(data, *references)):
-            lit[at] = not self.light.unlit(int(frames[at]))
+        references = None if used is None else (used.dark[part], used.flats[0][1][part])
+        for at in np.flatnonzero(self.scan.suspect(data, references)):
+            lit[at] = not self.scan.unlit(int(frames[at]))
         if not lit.all():
             data, frames = data[lit], frames[lit]
         if rows is None and used is not None:
@@ -243,7 +247,7 @@ class ViewReader:
 
     def tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
         """Name the views without light among those asked for, once, and the gap that they leave."""
-        unlit = np.array([row for row in asked.tolist() if self.light.known.get(row) is False], np.int64)
+        unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(self.scan.known_unlit, np.int64))
         if (news := np.setdiff1d(unlit, sorted(self.named))).size == 0:
             return
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self.source, asked, lit)) else ""
@@ -258,8 +262,8 @@ class ViewReader:
         """The error where none of the views can be used."""
         beside_flats = (
             ""
-            if self.light.flat is None
-            else f" The brightest have {self.light.usual:.2g} of the flats' light. Where views were divided by their "
+            if self.references is None
+            else f" The brightest have {self.scan.brightest:.2g} of the flats' light. Where views were divided by their "
             "flats already, say --quantity transmission, or line-integrals."
         )
         return NoViewError(

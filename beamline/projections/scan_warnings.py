@@ -18,6 +18,7 @@ from beamline.projections.registry import in_order
 from beamline.projections.selection import Selection, pixel_size
 from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import without_air
 from recon.base.masks import areas
 from recon.voxels.direct import has_direct_method
@@ -60,19 +61,19 @@ def warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float
         )
 
 
-def warn_of_the_field(source: ScanSource, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
+def warn_of_the_field(scan: ScanEvidence, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
     """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
     projections, geometry = prepared.projections, prepared.geometry
     edges = FieldEdges.of(projections.data, geometry, prepared.shares)
     unlevelled = not any(projections.air_columns)
     if sides := edges.beyond():
         light = ""
-        if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
-            light = without_air(source, edges.mean)
+        if unlevelled and scan.in_counts and selection.step(Air).model != "none":
+            light = without_air(scan, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
-        wide = not geometry.ordinary.all() or bool(source.table.wide_views.size)
+        wide = not geometry.ordinary.all() or bool(scan.table.wide_views.size)
         warn(f"{cut_sentence(sides, continued, wide)} {light}".rstrip())
-        if unlevelled and (change := uncorrected_current(source, selection)):
+        if unlevelled and (change := uncorrected_current(scan, selection)):
             warn(change)
     elif ranges := edges.passing():
         warn(passing_sentence(ranges, geometry.n_views))

@@ -30,7 +30,7 @@ from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, checked_views, correction_blockers, refuse
+from beamline.projections.views import ViewGeometry, checked_views, correction_blockers, evidence_of, refuse
 from beamline.reconstruct.followed_views import AxisSearch, Cursor, FollowedViews, FollowState, PassLaws
 from beamline.reconstruct.job import corrections_done, progress_events
 from beamline.reconstruct.options import ReconOptions
@@ -70,6 +70,7 @@ class ScanFollower:
         self.views, self._cursor = FollowedViews(source, options.selection), Cursor()
         self._references_follow = False  # darks or flats come after the views
         self._axis = AxisSearch(source, options.selection, warn)
+        self._scan = evidence_of(source, options.selection)
         self._correction: ScanCorrection | None = None  # None: waits for references
         self._fit: StreamingFit | None = None
         self._history: list[Progress] = []
@@ -132,7 +133,8 @@ class ScanFollower:
         Raises:
             DataError: the scan has ended, or something else is missing, and nothing will come.
         """
-        blockers = correction_blockers(self.source, self._options.selection)
+        self._scan = self._scan.renewed()
+        blockers = correction_blockers(self._scan)
         if not ended and (self._references_follow or any(finding.rule == "references" for finding in blockers)):
             if not self._references_follow:
                 message = "No darks or no flats before the views: the volume begins when the scan has ended"
@@ -140,7 +142,7 @@ class ScanFollower:
             self._references_follow = True
             return False
         refuse(self.source, blockers)
-        self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
+        self._correction = ScanCorrection(self._scan, self._options.selection, self._warn)
         self._tell(self._correction.done)
         return True
 
@@ -315,7 +317,8 @@ class ScanFollower:
         Raises:
             DataError: a scan without two views that can be used.
         """
-        usable = checked_views(self.source, self._options.selection, self._warn)
+        self._scan = self._scan.renewed()
+        usable = checked_views(self._scan, self._options.selection, self._warn)
         assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
@@ -361,10 +364,10 @@ class ScanFollower:
         """All views, now that they are there, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
         selection, projections = self._options.selection, self._joined()
-        places = ViewGeometry(self.source, selection, axis_col)
+        places = ViewGeometry(self._scan, selection, axis_col)
         geometry, axis = places.of(projections.view_ids), (axis_col, self._axis.estimate)
-        compare_with_flats(self.source, selection, projections, self._warn, refused=False)
-        prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
+        compare_with_flats(self._scan, selection, projections, self._warn, refused=False)
+        prepared = assemble(self._scan, selection, projections, geometry, axis, usable, self._warn)
         done = {**self._correction.done, **places.done}
         for step in in_order(selection):
             if isinstance(step, PlaceStep):

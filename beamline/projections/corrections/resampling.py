@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from beamline.core.sinks import Warn
     from beamline.projections.tilt import BandsDone
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.prep import resample
     from recon.prep.correct import Projections
 
@@ -148,7 +149,7 @@ class TiltAndLens:
 
 
 def with_tilt(
-    source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
+    scan: ScanEvidence, selection: Selection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
 ) -> tuple[Selection, str]:
     """The selection with the tilt found from all detector rows, if it asks for that; and a sentence about it.
 
@@ -166,13 +167,13 @@ def with_tilt(
     from recon.base.views import spread_views
     from recon.prep.tilt import STEEPEST
 
-    step = selection.step(TiltAndLens)
+    source, step = scan.source, selection.step(TiltAndLens)
     step.of(source, selection)  # refuses a cone
     if not step.sought:
         return selection, ""
     rows, frames = source.shape[0] // selection.binning, spread_views(source.table.angles[frames], _VIEWS, frames)
     try:
-        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, progress)
+        tilt, uncertainty = _refined(scan, replace(selection, rows=None), frames, progress)
     except ValueError as error:
         raise DataError(
             f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or leave it out."
@@ -205,7 +206,7 @@ def _search_memory(source: ScanSource, selection: Selection) -> int:
 
 
 def _refined(
-    source: ScanSource, selection: Selection, frames: NDArray[np.int64], progress: BandsDone
+    scan: ScanEvidence, selection: Selection, frames: NDArray[np.int64], progress: BandsDone
 ) -> tuple[float, float]:
     """The tilt by views that were levelled by the tilt of the last round, and its uncertainty; radians.
 
@@ -216,13 +217,13 @@ def _refined(
     from beamline.projections.tilt import shown_tilt
 
     plain, step = _without_blur(selection), selection.step(TiltAndLens)
-    rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
+    rows = (scan.source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
     tilt = 0.0
     for n in range(_ROUNDS):
         turned = plain.with_steps(replace(step, tilt=math.degrees(tilt)))
-        levelled = ScanCorrection(source, turned, lambda _: None, frames)
+        levelled = ScanCorrection(scan, turned, lambda _: None, frames)
         residual = shown_tilt(
-            source, levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress)
+            scan.source, levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress)
         )
         tilt += residual.tilt
         if abs(residual.tilt) < residual.uncertainty / 4 or abs(residual.tilt) * rows < _NOTHING / 2:

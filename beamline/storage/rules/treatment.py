@@ -14,10 +14,11 @@ from beamline.monitor.check import Level
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
-from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import Mask
 
+FLAGS = "flags"
 LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
 MARGIN = 0.25  # of the region's shorter side, on all sides
 
@@ -114,19 +115,15 @@ FEWEST_VIEWS = 10
 """Views without an alarm that a volume takes at least, where some have one: so few are a sketch of the sample."""
 
 
-def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iterator[Finding]:
-    """Number of flagged frames by check and level, and the rows of those with an alarm.
-
-    Args:
-        judged: flags that count in place of the file's.
-    """
-    flags = source.table.flags if judged is None else judged
+def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:
+    """Number of flagged frames by check and level, and the rows of those with an alarm."""
+    flags = scan.flags
     if flags is None or not flags.flagged.any():
         return
-    rows, again = np.flatnonzero(flags.alarmed), source.table.replaced
+    rows, again = np.flatnonzero(flags.alarmed), scan.table.replaced
     message = f"The monitor flagged {flags.flagged.sum()} of {flags.bits.size} frames: {counted(flags.counts())}."
     if not rows.size:
-        yield Finding("info", "flags", message)
+        yield Finding("info", FLAGS, message)
         return
     message += f" Frames with an alarm: {spans(rows.tolist())}."
     if again.size:
@@ -136,18 +133,18 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
         )
         rows = np.setdiff1d(rows, again)
         if not rows.size:
-            yield Finding("info", "flags", f"{message} No other frame has an alarm.")
+            yield Finding("info", FLAGS, f"{message} No other frame has an alarm.")
             return
         message += f" Frames with an alarm beside these: {spans(rows.tolist())}."
-    treated = treatment_of(flags, source.table.are_views, source.shape)
+    treated = treatment_of(flags, scan.table.are_views, scan.source.shape)
     n, lost = int(treated.views.sum()), int(treated.left_out.sum())
     if lost and n - lost < FEWEST_VIEWS:
         message += (
             f" {n - lost} of {n} views are left, {FEWEST_VIEWS} are needed: repeat the scan. "
             "`beamline recon --flags ignore` takes all views, flagged ones too."
         )
-        yield Finding("error", "flags", message)
+        yield Finding("error", FLAGS, message)
         return
     if treated.in_words:
         message += f" A reconstruction (--flags use): {treated.in_words}"
-    yield Finding("warning", "flags", message)
+    yield Finding("warning", FLAGS, message)

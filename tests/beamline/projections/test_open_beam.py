@@ -15,6 +15,7 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import hold_out
 from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
+from beamline.projections.views import evidence_of
 from recon.base.choices import Noise
 from recon.prep.counts import Counts, line_integrals
 from tests.beamline.array_source import ArraySource, scan_of
@@ -36,7 +37,8 @@ def scan(photons: float, n_flats: int = 20, n_darks: int = 10) -> ArraySource:
 
 
 def correction_of(source: Any, *steps: PrepStep, **chosen: Any) -> ScanCorrection:
-    return ScanCorrection(source, replace(PLAIN, **chosen).with_steps(*steps), pytest.fail)
+    selection = replace(PLAIN, **chosen).with_steps(*steps)
+    return ScanCorrection(evidence_of(source, selection), selection, pytest.fail)
 
 
 def test_line_integrals_and_weights_are_those_of_counts() -> None:

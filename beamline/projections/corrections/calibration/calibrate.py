@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from beamline.projections.prepared import PreparedProjections
     from beamline.projections.protocols import ScanPart
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
     from recon.features.calibration.joint import GeometryChange
@@ -106,14 +107,14 @@ class Calibrate:
 
     def learn(
         self,
-        source: ScanSource,
+        scan: ScanEvidence,
         selection: Selection,
         frames: NDArray[np.int64],
         geometry_before: GeometryOf,
         progress: Callable[[int, int], None],
     ) -> Calibrated:
         """Calibrate the geometry of these frames with the terms of this step."""
-        return calibrated(source, selection, frames, geometry_before, self.geometry, progress)
+        return calibrated(scan, selection, frames, geometry_before, self.geometry, progress)
 
     def apply(
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
@@ -167,7 +168,7 @@ class Calibrated:
 
 
 def calibrated(
-    source: ScanSource,
+    scan: ScanEvidence,
     selection: Selection,
     frames: I64,
     geometry_before: GeometryOf,
@@ -188,8 +189,8 @@ def calibrated(
     from recon.base.masks import areas
     from recon.features.calibration.learn import learn_geometry
 
-    band = _band(source, selection)
-    views = line_integrals_of(source, band, frames)
+    source, band = scan.source, _band(scan.source, selection)
+    views = line_integrals_of(scan, band, frames)
     ids = views.view_ids
     before = geometry_before(band, ids)
     lit = ~areas(views.masked)

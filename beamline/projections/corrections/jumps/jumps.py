@@ -20,6 +20,7 @@ from recon.base.volume import Grid
 
 if TYPE_CHECKING:
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
 
@@ -63,16 +64,16 @@ class Jumps:
 
     def place(
         self,
-        source: ScanSource,
+        scan: ScanEvidence,
         selection: Selection,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        if stated_poses(source, selection) is not None:  # it states where the sample was
+        if stated_poses(scan.source, selection) is not None:  # it states where the sample was
             return Unmoved(usable.frames)
         if self.corrects_jumps:
-            return find_jumps(source, selection, usable.frames, usable.jumps, axis_col, progress)
+            return find_jumps(scan, selection, usable.frames, usable.jumps, axis_col, progress)
         where = frames_text(usable.jumps)
         sentence = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
         return SampleJumps(usable.frames, sentence if usable.jumps.size else "")
@@ -100,7 +101,7 @@ class SampleJumps:
 
 
 def find_jumps(
-    source: ScanSource,
+    scan: ScanEvidence,
     selection: Selection,
     frames: I64,
     jumps: I64,
@@ -120,14 +121,14 @@ def find_jumps(
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
         return SampleJumps(frames)
-    if cone_of(source, selection) is not None:
+    if cone_of(scan.source, selection) is not None:
         where = frames_text(jumps)
         return SampleJumps(
             frames,
             f"The sample jumped at {where}. Views of a cone beam are not compared for that: they are used as if it had "
             "not moved. Choose those of one side with --views.",
         )
-    coarse, runs, most = _CoarseViews(source, selection, axis_col), [frames], jumps.size * (jumps.size + 1) // 2
+    coarse, runs, most = _CoarseViews(scan, selection, axis_col), [frames], jumps.size * (jumps.size + 1) // 2
     part = np.searchsorted(jumps, frames, side="right")
     steady = frames[np.bincount(part)[part] >= LEAST]  # views between two alarms are no part of a comparison
     real, at, n = list[int](), 0, 0
@@ -172,7 +173,7 @@ def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
 class _CoarseViews:
     """Coarse pixels of some rows, in which parts of a scan are compared."""
 
-    source: ScanSource
+    scan: ScanEvidence
     selection: Selection
     axis_col: float
 
@@ -187,9 +188,9 @@ class _CoarseViews:
         looked = np.sort(np.concatenate([own[:: 1 if own.size <= _SHORT else step] for own in some]))
         moves: list[Displacement] | None = None
         for cols, rounds in _LEVELS:
-            band = self.band(cols)
-            views = line_integrals_of(self.source, band, frames[looked])
-            geometry = geometry_of(self.source, band, self.axis_col, self.source.table.angles[views.view_ids])
+            band = _band(self.scan.source, self.selection, cols)
+            views = line_integrals_of(self.scan, band, frames[looked])
+            geometry = geometry_of(self.scan.source, band, self.axis_col, self.scan.table.angles[views.view_ids])
             group = part[np.searchsorted(frames, views.view_ids)]
             seen = views.data, geometry, group, ~areas(views.masked)
             moves = displacements(*seen, moves, rounds)
@@ -200,14 +201,15 @@ class _CoarseViews:
         jumped = (1 - _HELPS) * still.overall / moved.overall if far >= LARGEST else 0.0
         return max(jumped, still.together / still.alone / (1 + _HELPS), other)
 
-    def band(self, cols: int) -> Selection:
-        """Binned pixels, and rows around the middle of those that are used, also outside them."""
-        width, height = self.source.shape[1] // self.selection.binning, self.source.shape[0]
-        binning = self.selection.binning * max(1, math.ceil(width / cols))
-        used = rows_of(self.source, self.selection)
-        n = min(_ROWS * binning, height)
-        first = min(max((used.start + used.stop - n) // 2, 0), height - n)
-        return replace(self.selection, rows=(first, first + n), binning=min(binning, n))
+
+def _band(source: ScanSource, selection: Selection, cols: int) -> Selection:
+    """Binned pixels, and rows around the middle of those that are used, also outside them."""
+    width, height = source.shape[1] // selection.binning, source.shape[0]
+    binning = selection.binning * max(1, math.ceil(width / cols))
+    used = rows_of(source, selection)
+    n = min(_ROWS * binning, height)
+    first = min(max((used.start + used.stop - n) // 2, 0), height - n)
+    return replace(selection, rows=(first, first + n), binning=min(binning, n))
 
 
 def _search_memory(source: ScanSource, selection: Selection) -> int:
@@ -220,10 +222,9 @@ def _search_memory(source: ScanSource, selection: Selection) -> int:
     jumps = usable_views(source, asked.uses_flags).jumps
     if cone_of(source, selection) is not None or not (asked.judged or jumps.size):
         return 0
-    coarse = _CoarseViews(source, selection, (source.shape[1] - 1) / 2)
     n = min(source.table.views.size, _VIEWS + 2 * _SHORT)
-    band = coarse.band(_LEVELS[-1][0])
-    views = geometry_of(source, band, coarse.axis_col, np.linspace(0, math.pi, n, endpoint=False))
+    band = _band(source, selection, _LEVELS[-1][0])
+    views = geometry_of(source, band, (source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
     copy = 4 * n * math.prod(views.detector_shape)
     work = OsSirtTv(iterations=SWEEPS, momentum=True).memory(views, Grid.matching(views), weighted=True)
     return copy + max(at_once_memory(source, band, n), work + _COPIES * copy)

@@ -17,6 +17,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanPart
 from beamline.projections.selection import Selection
 from beamline.projections.step import NamedStep
+from beamline.projections.views import evidence_of
 from recon.features.phase import FilterLength
 from recon.prep.correct import Projections, merge_and_empty
 from tests.beamline.array_source import ArraySource, counted
@@ -34,7 +35,7 @@ def _source() -> ArraySource:
 
 
 def _correction(selection: Selection) -> ScanCorrection:
-    return ScanCorrection(_source(), selection, pytest.fail)
+    return ScanCorrection(evidence_of(_source(), selection), selection, pytest.fail)
 
 
 def test_batches_and_views_on_disk_are_the_views_at_once() -> None:
