@@ -263,8 +263,8 @@ class ViewReader:
         beside_flats = (
             ""
             if self.references is None
-            else f" The brightest have {self.scan.brightest:.2g} of the flats' light. Where views were divided by their "
-            "flats already, say --quantity transmission, or line-integrals."
+            else f" The brightest have {self.scan.brightest:.2g} of the flats' light. Where views were divided by "
+            "their flats already, say --quantity transmission, or line-integrals."
         )
         return NoViewError(
             f"{self.source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have no "
