@@ -13,7 +13,7 @@ from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrection, line_integrals_of
 from beamline.projections.corrections.poses import poses_of, stated_poses
-from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned
+from beamline.projections.selection import ScanSelection, check_axis, unbinned
 from beamline.projections.usable_views import UsableViews, longest_part
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
@@ -36,7 +36,7 @@ _GUESSED = 0.01  # of the mass in filled pixels moves the centre of mass by at m
 
 def rotation_axis(
     scan: ScanEvidence,
-    selection: Selection,
+    selection: ScanSelection,
     correction: ScanCorrection,
     usable: UsableViews,
     warn: Warn,
@@ -52,7 +52,7 @@ def rotation_axis(
     if (stated := poses_of(source, selection, usable.frames)) is not None and stated.vectors is not None:
         return stated.axis_col, None
     posed = stated_poses(source, selection) is not None  # opposite views are then no mirror images
-    if axis_col is None and (posed or cone_of(source, selection) is not None):
+    if axis_col is None and (posed or selection.cone is not None):
         axis_col, axis = _axis_by_views(scan, selection, usable, warn, progress)
     elif axis_col is None:
         whole = selection.axis_rows
@@ -61,7 +61,7 @@ def rotation_axis(
             by = ScanCorrection(scan, replace(selection, rows=whole), lambda _: None, usable.frames)
         axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
     check_axis(source, axis_col)
-    straight = not posed and cone_of(source, selection) is None
+    straight = not posed and selection.cone is None
     if selection.axis_col is not None and straight and usable.frames.size >= _FEWEST:
         _compare_with_views(source, axis_col, correction, usable.frames, warn)
     return axis_col, axis
@@ -83,13 +83,13 @@ def _compare_with_views(
 
 
 def _axis_by_views(
-    scan: ScanEvidence, selection: Selection, usable: UsableViews, warn: Warn, progress: Callable[[int, int], None]
+    scan: ScanEvidence, selection: ScanSelection, usable: UsableViews, warn: Warn, progress: Callable[[int, int], None]
 ) -> tuple[float, AxisEstimate | None]:
     """The axis by views held out. What the file states stays, unless they agree better with another one."""
     source, stated, cols = scan.source, scan.source.axis_col, scan.source.shape[1]
     if selection.axis_rows is not None:
         selection = replace(selection, rows=selection.axis_rows)
-    rows = rows_of(source, selection)
+    rows = selection.detector_rows
     # Few rows would leave columns fine, for which volumes take minutes: rows beside them are read, too.
     height = max(rows.stop - rows.start, min(cols // COLS, source.shape[0]))
     first = min(max((rows.start + rows.stop - height) // 2, 0), source.shape[0] - height)
@@ -100,7 +100,7 @@ def _axis_by_views(
         frames = frames[poses.stated(frames)]
     views = line_integrals_of(scan, coarse, spread(frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
-    geometry = geometry_of(source, coarse, begin, source.table.angles[views.view_ids])
+    geometry = coarse.geometry(begin, source.table.angles[views.view_ids])
     if poses is not None:
         geometry = poses.corrected(geometry, views.view_ids)
     try:

@@ -14,7 +14,7 @@ from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import Selection
+from beamline.projections.selection import ScanSelection
 from beamline.projections.tilt import MATTERS, tilt_text
 from beamline.projections.views import refuse
 from beamline.storage.rules.evidence import ScanEvidence
@@ -80,7 +80,7 @@ class Law:
         return f"{self.residual:.3g} {self.unit} (tolerance {self.tolerance:.3g})"
 
 
-def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, warn: Warn) -> dict[str, str]:
+def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelection, warn: Warn) -> dict[str, str]:
     """Warn of consistency conditions that the views violate; returns the residual of each in words, by name.
 
     Angles, heights, turned frames, masses and an axis that moments of the views disagree with, which hold for a
@@ -95,7 +95,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     known = prepared.measured is None and prepared.projections.floored <= _FLOORED
     if geometry.shifts.any() or not geometry.is_straight or whole.size < _LEAST_VIEWS or not known:
         return {}
-    laws = _laws_of(prepared, whole=selection.rows is None)
+    laws = _laws_of(prepared, whole=selection.asked.rows is None)
     for law in laws:
         if law.broken:
             warn(law.sentence)
@@ -139,7 +139,7 @@ def _laws_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]
 
 
 def compare_with_flats(
-    scan: ScanEvidence, selection: Selection, projections: Projections, warn: Warn, *, refused: bool = True
+    scan: ScanEvidence, selection: ScanSelection, projections: Projections, warn: Warn, *, refused: bool = True
 ) -> dict[str, str]:
     """Warn of views whose light does not match their flats; returns in words how bright their air is relative to the
     flats.

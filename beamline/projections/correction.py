@@ -18,7 +18,7 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import current_scale
 from beamline.projections.open_beam import OpenBeam, Shadow, count_references, foreign_to_lines
 from beamline.projections.read import ViewFilters, ViewReader, reading_memory
-from beamline.projections.selection import Selection
+from beamline.projections.selection import ScanSelection, Selection
 from beamline.projections.step import StepDone
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import ScanSource
@@ -94,7 +94,7 @@ class ScanPlan:
             return replace(self, shadow=self.beam.shadow(source, views, read.start, n))
 
 
-def survey(scan: ScanEvidence, selection: Selection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS) -> ScanPlan:
+def survey(scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS) -> ScanPlan:
     """Read the reference frames that the scan has, and of a finished scan some views.
 
     Groups of references with a fault are used only where no other is left.
@@ -149,6 +149,7 @@ class ScanCorrection:
         self, scan: ScanEvidence, selection: Selection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
     ) -> None:
         """Survey the scan; arguments and errors are those of `survey`."""
+        selection = selection.of(scan.source)
         self.plan = survey(scan, selection, warn, views)
         self.rows, self.binning = self.plan.filters.rows, selection.binning
         self._scan, self._source, self._selection = scan, scan.source, selection
@@ -343,7 +344,7 @@ class ScanCorrection:
 _NOTHING = np.empty((0, 0, 0), np.float32), NO_VIEWS
 
 
-def line_integrals_of(scan: ScanEvidence, selection: Selection, frames: NDArray[np.int64]) -> Projections:
+def line_integrals_of(scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64]) -> Projections:
     """Line integrals of some frames of a finished scan, corrected for themselves and without a warning.
 
     Raises:
@@ -364,7 +365,7 @@ def _by_angle(table: FrameTable, frames: NDArray[np.int64]) -> NDArray[np.intp]:
     return np.arange(frames.size) if in_time else np.lexsort((angles, places))
 
 
-def at_once_memory(source: ScanSource, selection: Selection, frames: int, rows: slice | None = None) -> int:
+def at_once_memory(source: ScanSource, selection: ScanSelection, frames: int, rows: slice | None = None) -> int:
     """Memory in bytes for correcting so many frames at once, line integrals included; `rows` as in `at_once`.
 
     Raises:

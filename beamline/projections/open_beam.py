@@ -20,7 +20,7 @@ from beamline.projections.corrections.references import (
     with_dynamic_flats,
 )
 from beamline.projections.read import read_binned, spoilt_frames, tell_damaged
-from beamline.projections.selection import Selection
+from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
@@ -61,7 +61,7 @@ class OpenBeam:
     done: dict[str, StepDone]
 
     @classmethod
-    def of(cls, scan: ScanEvidence, selection: Selection, read: slice, rows: slice, warn: Warn) -> OpenBeam:
+    def of(cls, scan: ScanEvidence, selection: ScanSelection, read: slice, rows: slice, warn: Warn) -> OpenBeam:
         """The open beam from the reference frames in the file; a faulty group is used only if there is no other.
 
         Args:
@@ -140,7 +140,7 @@ _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's 
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
 
 
-def photons_of(scan: ScanEvidence, references: References, rows: slice, selection: Selection) -> Photons | None:
+def photons_of(scan: ScanEvidence, references: References, rows: slice, selection: ScanSelection) -> Photons | None:
     """Photon statistics of the (binned) pixels of a scan; None if logarithms are to be taken.
 
     The gain is that of the selection, or the photon transfer of the largest group of flats. The readout noise is that

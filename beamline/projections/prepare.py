@@ -28,7 +28,7 @@ from beamline.projections.scan_warnings import (
     warn_of_the_field,
     warn_of_units,
 )
-from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
+from beamline.projections.selection import ScanSelection, Selection, choose_views
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
 from beamline.projections.views import ViewGeometry, checked_views, evidence_of
@@ -87,12 +87,13 @@ def prepare_projections(
     """
     phases = phases or Phases()
     phases.enter("flags and references")
+    selection = selection.of(source)
     scan = evidence_of(source, selection, known)
     usable, poses, wide = _usable(scan, selection, warn)
     phases.enter("tilt and references", "bands")
     selection, sought = with_tilt(scan, selection, usable.frames, warn, phases.progress)
     correction = ScanCorrection(scan, selection, warn, usable.frames)
-    if poses is None and selection.step(TiltAndLens).tilt is None and cone_of(source, selection) is None:
+    if poses is None and selection.step(TiltAndLens).tilt is None and selection.cone is None:
         warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(scan, selection, correction, usable, warn, phases.progress)
@@ -149,10 +150,11 @@ def _with_held_out(
 
 def require_usable(source: ScanSource, selection: Selection) -> None:
     """Raise the errors of `prepare_projections` that can be found without reading a frame."""
-    _usable(evidence_of(source, selection), selection, lambda sentence: None)
+    selected = selection.of(source)
+    _usable(evidence_of(source, selected), selected, lambda sentence: None)
 
 
-def _usable(scan: ScanEvidence, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
+def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
     """The usable views, their stated poses, and rows of wide views; refuses what is wrong before any frame is read."""
     source = scan.source
     warn_of_joined_views(source, warn)
@@ -204,7 +206,7 @@ def _corrected(
 
 
 def _after_scan_steps(
-    source: ScanSource, selection: Selection, prepared: PreparedProjections, phases: Phases
+    source: ScanSource, selection: ScanSelection, prepared: PreparedProjections, phases: Phases
 ) -> PreparedProjections:
     """The views after the steps on all of them, which change line integrals in place."""
     done, steps = dict(prepared.done), [step for step in in_order(selection) if isinstance(step, ScanStep)]
@@ -235,7 +237,7 @@ def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
 
 def assemble(
     scan: ScanEvidence,
-    selection: Selection,
+    selection: ScanSelection,
     projections: Projections,
     geometry: Geometry,
     axis: tuple[float, AxisEstimate | None],
@@ -255,7 +257,7 @@ def assemble(
         DataError: fewer than two views, or nothing in the beam.
     """
     source, (height, width) = scan.source, geometry.detector_shape
-    rows = rows_of(source, selection)
+    rows = selection.detector_rows
     binning, first = selection.binning, ViewFilters.of(source, selection).read(None).start
     ids = projections.view_ids
     if ids.size < 2:
@@ -280,7 +282,7 @@ def assemble(
         axis=estimate,
         held_out=None,
         n_projections=source.table.views.size,
-        length_unit="px" if pixel_size(source, selection) is None else "mm",
+        length_unit="px" if selection.pixel_size_mm is None else "mm",
         quantity=source.quantity,
         view_weights=usable.weights_of(ids),
         left_out=usable.left_out,
@@ -296,9 +298,9 @@ def assemble(
     return prepared
 
 
-def _stated_radius(source: ScanSource, selection: Selection) -> float | None:
+def _stated_radius(source: ScanSource, selection: ScanSelection) -> float | None:
     """Half the width of the sample in mm (px where the pixel size is unknown), as asked for or as the file says."""
-    stated = source.attributes.get("sample_diameter_mm") if pixel_size(source, selection) is not None else None
+    stated = source.attributes.get("sample_diameter_mm") if selection.pixel_size_mm is not None else None
     width = stated if selection.sample_width is None else selection.sample_width
     return None if width is None else float(width) / 2
 

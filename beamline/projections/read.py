@@ -16,7 +16,7 @@ from beamline.core.text import count, spans
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ViewFilter, ViewStep
 from beamline.projections.registry import in_order
-from beamline.projections.selection import Selection, rows_of
+from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import gap_sentence
 from beamline.storage.datasets import HELD
@@ -83,7 +83,9 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.where(count > 0, total / np.maximum(count, 1), np.float32(np.nan)).astype(np.float32)
 
 
-def tell_damaged(source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn) -> NDArray[np.bool_]:
+def tell_damaged(
+    source: ScanSource, selection: ScanSelection, frames: NDArray[np.int64], warn: Warn
+) -> NDArray[np.bool_]:
     """Report which frames are left out: unreadable ones and, if the selection says so, those that differ from their
     checksum. Each is named in a warning.
     """
@@ -129,13 +131,13 @@ class ViewFilters:
     height: int
 
     @classmethod
-    def of(cls, source: ScanSource, selection: Selection) -> ViewFilters:
+    def of(cls, source: ScanSource, selection: ScanSelection) -> ViewFilters:
         """The filters of a selection.
 
         Raises:
             ConfigError: rows or binning that do not fit the detector, or filters of counted photons.
         """
-        rows = rows_of(source, selection)
+        rows = selection.detector_rows
         outcomes = {step.name: step.on(source, selection) for step in in_order(selection) if isinstance(step, ViewStep)}
         filters = tuple(each for each, _ in outcomes.values() if each is not None)
         if filters and selection.step(Preparation).noise == "counts":
@@ -191,7 +193,7 @@ class ViewReader:
     """
 
     scan: ScanEvidence
-    selection: Selection
+    selection: ScanSelection
     filters: ViewFilters
     references: References | None
     warn: Warn

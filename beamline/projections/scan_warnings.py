@@ -15,7 +15,7 @@ from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order
-from beamline.projections.selection import Selection, pixel_size
+from beamline.projections.selection import ScanSelection
 from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
@@ -39,9 +39,9 @@ def warn_of_joined_views(source: ScanSource, warn: Warn) -> None:
         )
 
 
-def warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
+def warn_of_units(source: ScanSource, selection: ScanSelection, warn: Warn) -> None:
     """Warn of a size, an energy or a distance that no instrument has, as by a mistaken unit."""
-    size_mm = pixel_size(source, selection)
+    size_mm = selection.pixel_size_mm
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
     for step in in_order(selection):  # options of the same names
         stated += [(name, getattr(step, name, None)) for name in ("pixel_size_um", "energy_kev", "distance_mm")]
@@ -50,7 +50,7 @@ def warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
             warn(sentence)
 
 
-def warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:
+def warn_of_other_axis(source: ScanSource, selection: ScanSelection, axis_col: float, warn: Warn) -> None:
     """Tell that poses of a volume are used with another rotation axis than they were learnt or used with."""
     table = stated_poses(source, selection)
     poses_axis = None if table is None else table.axis_col
@@ -61,7 +61,7 @@ def warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float
         )
 
 
-def warn_of_the_field(scan: ScanEvidence, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
+def warn_of_the_field(scan: ScanEvidence, selection: ScanSelection, prepared: PreparedProjections, warn: Warn) -> None:
     """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
     projections, geometry = prepared.projections, prepared.geometry
     edges = FieldEdges.of(projections.data, geometry, prepared.shares)

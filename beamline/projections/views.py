@@ -17,7 +17,7 @@ from beamline.projections.corrections.width import Width
 from beamline.projections.protocols import GeometryLearnt, PlaceStep, ViewMotion
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.replay import judged_flags
-from beamline.projections.selection import Selection, choose_views, cone_of, geometry_of
+from beamline.projections.selection import ScanSelection, Selection, choose_views
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
@@ -30,7 +30,7 @@ from beamline.storage.rules.treatment import FLAGS
 from recon.base.geometry import Geometry
 
 
-def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
+def stated_geometry(source: ScanSource, selection: ScanSelection) -> Geometry:
     """The geometry of the selected views, as scan and options state it, before any frame is read.
 
     An axis that is to be found is taken in the middle; views without an angle or a pose are left out.
@@ -46,7 +46,7 @@ def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
     frames = frames[choose_views(source, frames, selection)]
     stated = source.axis_col if selection.axis_col is None else selection.axis_col
     axis_col = (source.shape[1] - 1) / 2 if stated is None else stated
-    geometry = geometry_of(source, selection, axis_col, source.table.angles[frames])
+    geometry = selection.geometry(axis_col, source.table.angles[frames])
     if poses is not None:
         geometry = poses.corrected(geometry, frames)
     return selection.step(Width).rays(source, selection, geometry)[0]
@@ -64,7 +64,7 @@ class ViewGeometry:
     """
 
     scan: ScanEvidence
-    selection: Selection
+    selection: ScanSelection
     stated_axis: float
     moved: dict[str, ViewMotion] = field(default_factory=dict)
     width: StepDone = field(default_factory=StepDone)
@@ -99,10 +99,10 @@ class ViewGeometry:
                 learnt = step.learn(self.scan, self.selection, view_ids, self.uncalibrated, phases.progress)
                 self.learnt[step.name] = learnt
 
-    def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
+    def uncalibrated(self, part: ScanSelection, view_ids: NDArray[np.int64]) -> Geometry:
         """The geometry of views without calibration."""
         source = self.scan.source
-        geometry = geometry_of(source, part, self.stated_axis, source.table.angles[view_ids])
+        geometry = part.geometry(self.stated_axis, source.table.angles[view_ids])
         if (aside := source.table.aside) is not None:
             geometry = replace(geometry, shifts=np.outer(aside[view_ids] / geometry.pixel_pitch, (1.0, 0.0)))
         for motion in self.moved.values():
@@ -126,10 +126,10 @@ def evidence_of(source: ScanSource, selection: Selection, known: ScanEvidence | 
     asked = selection.step(Preparation)
     judged = judged_flags(source) if asked.judged and source.finished else None
     scan = ScanEvidence.of(source) if known is None else known
-    return replace(scan, accepted=asked.accepted, cone=cone_of(source, selection), judged=judged)
+    return replace(scan, accepted=asked.accepted, cone=selection.of(source).cone, judged=judged)
 
 
-def checked_views(scan: ScanEvidence, selection: Selection, warn: Warn) -> UsableViews:
+def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> UsableViews:
     """The usable views of a finished scan, by the flags of the monitor.
 
     Faults of the file that do not prevent a reconstruction are warned of, and so is the effect of the flags.
@@ -141,7 +141,7 @@ def checked_views(scan: ScanEvidence, selection: Selection, warn: Warn) -> Usabl
     by_option = {
         "central-column": selection.axis_col,
         "central-row": selection.central_row,
-        VARYING: selection.pixel_size_mm if selection.cone is None else selection.cone,
+        VARYING: selection.asked.pixel_size_mm if selection.asked.cone is None else selection.asked.cone,
     }
     findings = [hit for hit in findings_of(scan) if by_option.get(hit.rule) is None]
     findings = [hit for hit in findings if hit.rule != FLAGS or (asked.uses_flags and hit.severity == "error")]

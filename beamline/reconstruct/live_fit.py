@@ -67,10 +67,11 @@ class ScanFollower:
         self.source = source
         self.state = FollowState.WAITS_FOR_REFERENCES
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
-        self.views, self._cursor = FollowedViews(source, options.selection), Cursor()
+        self._selection = options.selection.of(source)
+        self.views, self._cursor = FollowedViews(source, self._selection), Cursor()
         self._references_follow = False  # darks or flats come after the views
-        self._axis = AxisSearch(source, options.selection, warn)
-        self._scan = evidence_of(source, options.selection)
+        self._axis = AxisSearch(source, self._selection, warn)
+        self._scan = evidence_of(source, self._selection)
         self._correction: ScanCorrection | None = None  # None: waits for references
         self._fit: StreamingFit | None = None
         self._history: list[Progress] = []
@@ -142,7 +143,7 @@ class ScanFollower:
             self._references_follow = True
             return False
         refuse(self.source, blockers)
-        self._correction = ScanCorrection(self._scan, self._options.selection, self._warn)
+        self._correction = ScanCorrection(self._scan, self._selection, self._warn)
         self._tell(self._correction.done)
         return True
 
@@ -318,11 +319,11 @@ class ScanFollower:
             DataError: a scan without two views that can be used.
         """
         self._scan = self._scan.renewed()
-        usable = checked_views(self._scan, self._options.selection, self._warn)
+        usable = checked_views(self._scan, self._selection, self._warn)
         assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
-        steps = in_order(self._options.selection)
+        steps = in_order(self._selection)
         if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
@@ -363,7 +364,7 @@ class ScanFollower:
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
         """All views, now that they are there, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
-        selection, projections = self._options.selection, self._joined()
+        selection, projections = self._selection, self._joined()
         places = ViewGeometry(self._scan, selection, axis_col)
         geometry, axis = places.of(projections.view_ids), (axis_col, self._axis.estimate)
         compare_with_flats(self._scan, selection, projections, self._warn, refused=False)

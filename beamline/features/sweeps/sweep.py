@@ -16,7 +16,7 @@ from beamline.core.sinks import Warnings
 from beamline.features.sweeps.values import SweptOption
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections, hold_out
-from beamline.projections.selection import Selection, cone_of, rows_of
+from beamline.projections.selection import Selection
 from beamline.reconstruct.job import compile_kernels, progress_events, runner_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.report.figures import WIDTH, new_figure, png, show_image
@@ -117,9 +117,10 @@ def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
 def _middle(trial: ReconOptions, halo: int) -> Selection:
     selection = trial.selection
     with trial.source.open() as source:
-        rows, n = rows_of(source, selection), selection.binning
-        if selection.rows is not None or cone_of(source, selection) is not None:
-            return selection
+        part, n = selection.of(source), selection.binning
+    if selection.rows is not None or part.cone is not None:
+        return selection
+    rows = part.detector_rows
     height = min(2 * halo + 1, (rows.stop - rows.start) // n) * n
     first = rows.start + (rows.stop - rows.start - height) // 2
     return replace(selection, rows=(first, first + height), axis_rows=selection.axis_rows or (rows.start, rows.stop))

@@ -15,7 +15,7 @@ from beamline.core.text import count, spans
 from beamline.monitor.evidence import BRIGHT
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.read import read_binned, spoilt_frames
-from beamline.projections.selection import Selection
+from beamline.projections.selection import ScanSelection
 from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
 from recon.prep.correct import References
@@ -43,7 +43,7 @@ class _Reading:
     spots: dict[int, int] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, scan: ScanEvidence, rows: slice, selection: Selection) -> _Reading:
+    def of(cls, scan: ScanEvidence, rows: slice, selection: ScanSelection) -> _Reading:
         binning = selection.binning
         flat = read_binned(scan.source, scan.used.flats[0][:1], rows, binning)
         light = float(np.percentile(np.nan_to_num(flat), BRIGHT))
@@ -81,7 +81,7 @@ class _Reading:
 
 
 def read_references(
-    scan: ScanEvidence, rows: slice, selection: Selection, warn: Warn = lambda sentence: None
+    scan: ScanEvidence, rows: slice, selection: ScanSelection, warn: Warn = lambda sentence: None
 ) -> References:
     """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are required.
 
@@ -125,7 +125,7 @@ def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) ->
     return dark_at(exposure, darks) if exposure > 0 else np.asarray(np.mean([dark for _, dark in darks], axis=0))
 
 
-def with_dynamic_flats(scan: ScanEvidence, references: References, rows: slice, selection: Selection) -> References:
+def with_dynamic_flats(scan: ScanEvidence, references: References, rows: slice, selection: ScanSelection) -> References:
     """The same references with the principal components of all flats that are used, which are read three times.
 
     Raises:
@@ -182,7 +182,7 @@ def current_scale(scan: ScanEvidence) -> NDArray[np.float64]:
     return _to_median(currents, scan.table.views)
 
 
-def uncorrected_current(scan: ScanEvidence, selection: Selection) -> str:
+def uncorrected_current(scan: ScanEvidence, selection: ScanSelection) -> str:
     """The warning that the ring current changed between flats and views and is not corrected; "" if it did not
     change."""
     known = scan.table.currents

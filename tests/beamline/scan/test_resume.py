@@ -169,7 +169,7 @@ def _assert_told_of_parts(run: Path) -> None:
         assert sum(finding.startswith(line) for finding in describe(part)["findings"]) == 1
         with open_scan(part) as source, pytest.raises(DataError, match=re.escape(line)):
             accepting = Selection(steps=(Preparation(references="accept"),))
-            checked_views(evidence_of(source, accepting), accepting, lambda _: None)
+            checked_views(evidence_of(source, accepting), accepting.of(source), lambda _: None)
         assert whole_scan(part) == run / "joined.h5" == watched(part).scan
     with closing(Reader(watched(run))) as reader:
         assert reader.state()["frames"] == open_scan(run / "joined.h5").table.kinds.size

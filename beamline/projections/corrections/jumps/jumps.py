@@ -13,7 +13,7 @@ from beamline.core.text import count, frames_text
 from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
-from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
+from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone, StepMemory, option
 from beamline.projections.usable_views import UsableViews, usable_views
 from recon.base.volume import Grid
@@ -65,7 +65,7 @@ class Jumps:
     def place(
         self,
         scan: ScanEvidence,
-        selection: Selection,
+        selection: ScanSelection,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
@@ -102,7 +102,7 @@ class SampleJumps:
 
 def find_jumps(
     scan: ScanEvidence,
-    selection: Selection,
+    selection: ScanSelection,
     frames: I64,
     jumps: I64,
     axis_col: float,
@@ -121,7 +121,7 @@ def find_jumps(
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
         return SampleJumps(frames)
-    if cone_of(scan.source, selection) is not None:
+    if selection.cone is not None:
         where = frames_text(jumps)
         return SampleJumps(
             frames,
@@ -174,7 +174,7 @@ class _CoarseViews:
     """Coarse pixels of some rows, in which parts of a scan are compared."""
 
     scan: ScanEvidence
-    selection: Selection
+    selection: ScanSelection
     axis_col: float
 
     def clearness(self, frames: I64, part: I64) -> float:
@@ -190,7 +190,7 @@ class _CoarseViews:
         for cols, rounds in _LEVELS:
             band = _band(self.scan.source, self.selection, cols)
             views = line_integrals_of(self.scan, band, frames[looked])
-            geometry = geometry_of(self.scan.source, band, self.axis_col, self.scan.table.angles[views.view_ids])
+            geometry = band.geometry(self.axis_col, self.scan.table.angles[views.view_ids])
             group = part[np.searchsorted(frames, views.view_ids)]
             seen = views.data, geometry, group, ~areas(views.masked)
             moves = displacements(*seen, moves, rounds)
@@ -202,17 +202,17 @@ class _CoarseViews:
         return max(jumped, still.together / still.alone / (1 + _HELPS), other)
 
 
-def _band(source: ScanSource, selection: Selection, cols: int) -> Selection:
+def _band(source: ScanSource, selection: ScanSelection, cols: int) -> ScanSelection:
     """Binned pixels, and rows around the middle of those that are used, also outside them."""
     width, height = source.shape[1] // selection.binning, source.shape[0]
     binning = selection.binning * max(1, math.ceil(width / cols))
-    used = rows_of(source, selection)
+    used = selection.detector_rows
     n = min(_ROWS * binning, height)
     first = min(max((used.start + used.stop - n) // 2, 0), height - n)
     return replace(selection, rows=(first, first + n), binning=min(binning, n))
 
 
-def _search_memory(source: ScanSource, selection: Selection) -> int:
+def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
     """Bytes that `find_jumps` takes at most; 0 if the flags in the file name no jump, and none are made."""
     from beamline.projections.correction import at_once_memory
     from recon.voxels.displacement import SWEEPS
@@ -220,11 +220,11 @@ def _search_memory(source: ScanSource, selection: Selection) -> int:
 
     asked = selection.step(Preparation)
     jumps = usable_views(source, asked.uses_flags).jumps
-    if cone_of(source, selection) is not None or not (asked.judged or jumps.size):
+    if selection.cone is not None or not (asked.judged or jumps.size):
         return 0
     n = min(source.table.views.size, _VIEWS + 2 * _SHORT)
     band = _band(source, selection, _LEVELS[-1][0])
-    views = geometry_of(source, band, (source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
+    views = band.geometry((source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
     copy = 4 * n * math.prod(views.detector_shape)
     work = OsSirtTv(iterations=SWEEPS, momentum=True).memory(views, Grid.matching(views), weighted=True)
     return copy + max(at_once_memory(source, band, n), work + _COPIES * copy)

@@ -73,7 +73,7 @@ def test_the_lens_keeps_its_centre() -> None:
     places = []
     for cols in ((0, 100), (30, 90)):
         source: Any = cropped(_Flagged(), cols)
-        found = TiltAndLens(distortion=lens).of(source, Selection())
+        found = TiltAndLens(distortion=lens).of(source, Selection().of(source))
         assert found is not None
         places.append(found.places(source.shape, 0)[1] + cols[0])
     np.testing.assert_allclose(places[1], places[0][:, 30:90])

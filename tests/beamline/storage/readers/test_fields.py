@@ -328,7 +328,7 @@ def _refused(path: Path, selection: Selection) -> str:
     """Why `recon` refuses a scan; "" if it does not."""
     with open_scan(path) as source:
         try:
-            checked_views(evidence_of(source, selection), selection, lambda sentence: None)
+            checked_views(evidence_of(source, selection), selection.of(source), lambda sentence: None)
         except DataError as error:
             return str(error)
     return ""
