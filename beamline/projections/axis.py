@@ -51,9 +51,10 @@ def rotation_axis(
         DataError: no axis explains the views.
         ConfigError: it lies outside the detector.
     """
-    source, axis_col, axis = scan.source, selection.axis_col, None
     if poses is not None and poses.vectors is not None:
         return poses.axis_col, None
+    source, axis = scan.source, None
+    axis_col = selection.axis_col
     straight = poses is None and cone_of(source, selection) is None
     if axis_col is None and not straight:
         axis_col, axis = _axis_by_views(scan, selection, usable.frames, poses, warn, progress)
