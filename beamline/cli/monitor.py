@@ -138,7 +138,7 @@ def _watched(
                     sink(FrameFlagged(flag, time=clock.now()))
             active = now
         summed = verdict(source, frames, limits)
-        ended = [finding.message for finding in scan_ended(ScanEvidence.of(source))]
+        ended = [finding.message for finding in scan_ended(ScanEvidence(source))]
         if request.sheet is not None:
             from beamline.reconstruct.scan_facts import worst_frames
 

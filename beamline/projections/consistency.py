@@ -162,7 +162,7 @@ def compare_with_flats(
         ]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
-    for finding in light_beside_flats(scan, level, air, scan.accepted or said or not refused):
+    for finding in light_beside_flats(scan, level, air, scan.asked.accepted or said or not refused):
         refuse(scan.source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}

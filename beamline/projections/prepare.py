@@ -31,7 +31,7 @@ from beamline.projections.scan_warnings import (
 from beamline.projections.selection import ScanSelection, Selection, choose_views
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, checked_views, evidence_of
+from beamline.projections.views import ViewGeometry, asked_of, checked_views, evidence_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import I64
@@ -66,7 +66,6 @@ def prepare_projections(
     buffer: DiskBuffer | None = None,
     check: Callable[[Geometry], object] | None = None,
     phases: Phases | None = None,
-    known: ScanEvidence | None = None,
 ) -> PreparedProjections:
     """Read, correct and align the views of `selection`.
 
@@ -79,7 +78,6 @@ def prepare_projections(
         check: raises what is wrong with the geometry of the views, as soon as the axis is known: before they are
             corrected.
         phases: takes the name of each phase as it begins.
-        known: of this scan, from an earlier preparation: frames that were looked at are not read again.
 
     Raises:
         DataError: the scan cannot be reconstructed; the message says why and what to do.
@@ -88,7 +86,7 @@ def prepare_projections(
     phases = phases or Phases()
     phases.enter("flags and references")
     selection = selection.of(source)
-    scan = evidence_of(source, selection, known)
+    scan = ScanEvidence(source, asked_of(source, selection))
     usable, poses, wide = _usable(scan, selection, warn)
     phases.enter("tilt and references", "bands")
     selection, sought = with_tilt(scan, selection, usable.frames, warn, phases.progress)
@@ -96,8 +94,8 @@ def prepare_projections(
     if poses is None and selection.step(TiltAndLens).tilt is None and selection.cone is None:
         warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
-    axis_col, axis = rotation_axis(scan, selection, correction, usable, warn, phases.progress)
-    warn_of_other_axis(source, selection, axis_col, warn)
+    axis_col, axis = rotation_axis(scan, selection, correction, usable, poses, warn, phases.progress)
+    warn_of_other_axis(poses, selection, axis_col, warn)
     phases.enter("jumps", "guesses")
     view_geometry = ViewGeometry(scan, selection, axis_col)
     usable = view_geometry.find_motion(usable, warn, phases)
@@ -165,7 +163,7 @@ def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[U
         step.refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
     poses = poses_of(source, selection, usable.frames)
     if poses is not None:
-        require_stated(poses, source, selection, usable.frames[first])
+        require_stated(poses, source, usable.frames[first])
         aside = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
         return replace(usable, frames=usable.frames[~aside]), poses, usable.frames[aside]
     return usable, poses, source.table.wide_views
@@ -179,7 +177,7 @@ def _chosen(
     chosen = choose_views(source, frames, selection, view_geometry.of(frames).period)
     used, rest = frames[chosen], np.delete(frames, chosen)
     if poses is not None:
-        require_stated(poses, source, selection, used)
+        require_stated(poses, source, used)
         rest = rest[poses.stated(rest)]
     return used, spread(rest, _HELD_OUT_VIEWS)
 

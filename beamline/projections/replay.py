@@ -15,7 +15,7 @@ from beamline.monitor.watch import look_past_failures, start
 from beamline.projections.replayed_frames import context_of, frames_of
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.evidence import Asked, ScanEvidence
 from beamline.storage.rules.scan import altered_sentence
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
@@ -167,13 +167,14 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
     """
     flags = [flag for each in judged for flag in each.flags]
     again = frozenset(source.table.replaced.tolist())
+    found = ScanEvidence(source, Asked(limits=limits)).findings
     failures = tuple(failure for each in judged for failure in each.failures)
     return ScanVerdict(
         n_frames=len(judged),
         kinds=by_kind(flags),
         alarmed=tuple(sorted({n for flag in flags if flag.level is Level.ALARM for n in flag.frames} - again)),
         retaken=tuple(sorted(again)),
-        references=tuple(finding.message for finding in ScanEvidence.of(source, limits).findings if finding.frames),
+        references=tuple(finding.message for finding in found if finding.frames),
         altered=altered_sentence(source) if source.table.altered.any() else "",
         aside=failures + (judged[-1].aside.in_words() if judged else ()),
     )

@@ -11,7 +11,7 @@ from beamline.core.sinks import Note, Warn
 from beamline.core.text import count, spans
 from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.poses import ScanPoses
 from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order
@@ -50,14 +50,14 @@ def warn_of_units(source: ScanSource, selection: ScanSelection, warn: Warn) -> N
             warn(sentence)
 
 
-def warn_of_other_axis(source: ScanSource, selection: ScanSelection, axis_col: float, warn: Warn) -> None:
+def warn_of_other_axis(poses: ScanPoses | None, selection: ScanSelection, axis_col: float, warn: Warn) -> None:
     """Tell that poses of a volume are used with another rotation axis than they were learnt or used with."""
-    table = stated_poses(source, selection)
-    poses_axis = None if table is None else table.axis_col
-    if poses_axis is not None and selection.axis_col is None and abs(poses_axis - axis_col) > _SAME_AXIS:
+    if poses is None or (of_poses := poses.table.axis_col) is None or selection.axis_col is not None:
+        return
+    if abs(of_poses - axis_col) > _SAME_AXIS:
         warn(
-            f"The poses of {table} go with the rotation axis of that volume, column {poses_axis:.2f}; column "
-            f"{axis_col:.2f} is used. Give --axis {poses_axis:.2f} to have both."
+            f"The poses of {poses.table} go with the rotation axis of that volume, column {of_poses:.2f}; column "
+            f"{axis_col:.2f} is used. Give --axis {of_poses:.2f} to have both."
         )
 
 

@@ -14,6 +14,7 @@ from recon.base.arrays import I64, bin_views
 if TYPE_CHECKING:
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.treatment import Treatment
     from recon.prep.resample import Resampling
 
 
@@ -147,7 +148,7 @@ def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None 
     good = np.flatnonzero(views & ~treated.left_out)
     gap = gap_sentence(source, rows, good)
     sentence = f"{treated.in_words}{gap and f' They{gap}.'} --flags ignore weighs all equally."
-    regions = regions_of(treated.flags, source.shape)
+    regions = regions_of(treated)
     return UsableViews(good, weights, int(treated.left_out.sum()), sentence, flags, regions, treated.jumps)
 
 
@@ -166,23 +167,11 @@ def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
     return period if sorted_angles.size == 0 else float(np.diff(sorted_angles, append=sorted_angles[0] + period).max())
 
 
-def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:
-    """The regions of warnings and alarms in frames of this shape; rays in an alarm region have weight 0."""
-    from beamline.storage.rules.treatment import boxes_of, flagged_in_part
-
-    boxes = [
-        (frame, box, 0.0 if flags.bits[frame] >> entry.alarm_bit & 1 else WARNED_SHARE)
-        for i, entry in enumerate(flags.legend)
-        for frame, box in boxes_of(flags, i, entry, shape)
-        if box is not None
-    ]
-    local = flagged_in_part(flags, shape)
-    kept = [each for each in boxes if local[each[0]]]
-    return Regions(
-        np.array([frame for frame, _, _ in kept], np.int64),
-        np.array([box for _, box, _ in kept], np.int64).reshape(-1, 4),
-        np.array([share for _, _, share in kept], np.float32),
-    )
+def regions_of(treated: Treatment) -> Regions:
+    """The regions of warnings and alarms in frames; rays in an alarm region have weight 0."""
+    frames, boxes, alarms = zip(*treated.parts, strict=True) if treated.parts else ((), (), ())
+    shares = np.where(np.array(alarms, np.bool_), np.float32(0), np.float32(WARNED_SHARE))
+    return Regions(np.array(frames, np.int64), np.array(boxes, np.int64).reshape(-1, 4), shares)
 
 
 def part_numbers(jumps: I64, rows: I64) -> I64:

@@ -23,8 +23,8 @@ from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.transforms import WRAPPED
 from beamline.storage.rules import Finding, angles_shown
-from beamline.storage.rules.evidence import ScanEvidence
-from beamline.storage.rules.scan import BEFORE_VIEWS, VARYING, findings_of
+from beamline.storage.rules.evidence import Asked, ScanEvidence
+from beamline.storage.rules.scan import VARYING, findings_of
 from beamline.storage.rules.stored_order import SINOGRAM
 from beamline.storage.rules.treatment import FLAGS
 from recon.base.geometry import Geometry
@@ -121,12 +121,16 @@ class ViewGeometry:
 _OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules on what vectors of each view take the place of
 
 
-def evidence_of(source: ScanSource, selection: Selection, known: ScanEvidence | None = None) -> ScanEvidence:
-    """The evidence of a scan for a reconstruction of `selection`, with the frames that are `known` of it."""
+def asked_of(source: ScanSource, selection: Selection) -> Asked:
+    """What a selection asks of the evidence of a scan; the monitor looks at its frames where that is asked for."""
     asked = selection.step(Preparation)
     judged = judged_flags(source) if asked.judged and source.finished else None
-    scan = ScanEvidence.of(source) if known is None else known
-    return replace(scan, accepted=asked.accepted, cone=selection.of(source).cone, judged=judged)
+    return Asked(asked.accepted, selection.cone, judged)
+
+
+def evidence_of(source: ScanSource, selection: Selection) -> ScanEvidence:
+    """The evidence of a scan for a reconstruction of `selection`."""
+    return ScanEvidence(source, asked_of(source, selection))
 
 
 def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> UsableViews:
@@ -148,7 +152,7 @@ def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> U
     if (poses := stated_poses(scan.source, selection)) is not None and poses.vectors is not None:
         findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
     refuse(scan.source, findings)
-    usable = usable_views(scan.source, asked.uses_flags, scan.judged)
+    usable = usable_views(scan.source, asked.uses_flags, scan.asked.judged)
     if usable.sentence:
         warn(Note(usable.sentence))
     for finding in findings:
@@ -164,8 +168,3 @@ def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
     reasons = [finding.message for finding in wrapped or errors]
     if reasons:
         raise DataError(f"{source.path} cannot be reconstructed. " + "\n  ".join(reasons))
-
-
-def correction_blockers(scan: ScanEvidence) -> list[Finding]:
-    """Reasons why the frames of a running scan cannot be corrected yet."""
-    return findings_of(scan, BEFORE_VIEWS)

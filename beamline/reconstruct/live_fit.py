@@ -30,12 +30,13 @@ from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, checked_views, correction_blockers, evidence_of, refuse
+from beamline.projections.views import ViewGeometry, checked_views, evidence_of, refuse
 from beamline.reconstruct.followed_views import AxisSearch, Cursor, FollowedViews, FollowState, PassLaws
 from beamline.reconstruct.job import corrections_done, progress_events
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.scan import BEFORE_VIEWS, findings_of
 from drivers.base.clock import Clock
 from recon.base.method import Progress
 from recon.prep.correct import Projections, merge_and_empty
@@ -135,7 +136,7 @@ class ScanFollower:
             DataError: the scan has ended, or something else is missing, and nothing will come.
         """
         self._scan = self._scan.renewed()
-        blockers = correction_blockers(self._scan)
+        blockers = findings_of(self._scan, BEFORE_VIEWS)
         if not ended and (self._references_follow or any(finding.rule == "references" for finding in blockers)):
             if not self._references_follow:
                 message = "No darks or no flats before the views: the volume begins when the scan has ended"

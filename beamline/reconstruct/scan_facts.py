@@ -210,7 +210,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
         references=reference_images(source),
         shape=source.shape,
         columns=columns,
-        ended=" ".join(finding.message for finding in scan_ended(ScanEvidence.of(source))) if source.finished else "",
+        ended=" ".join(finding.message for finding in scan_ended(ScanEvidence(source))) if source.finished else "",
         frames_per_view=source.frames_per_view,
     )  # fmt: skip
 

@@ -63,7 +63,7 @@ def of_source(source: ScanSource, axis: float | None = None) -> list[Row]:
     whole = verdict(source, judged)
     rows += [["monitor", "references", "", "", sentence] for sentence in whole.references]
     rows += [["monitor", "left out", "", "", sentence] for sentence in whole.aside]
-    scan = ScanEvidence.of(source)
+    scan = ScanEvidence(source)
     found = dict.fromkeys([*source_findings(scan), *views_lit(scan, every=True)])
     rows += [["validate", each.rule, each.severity, "", each.message] for each in found]
     return rows + prepared(source, axis)

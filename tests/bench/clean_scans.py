@@ -143,7 +143,7 @@ def told_of(source: ArraySource) -> list[str]:
     """What a reconstruction, `validate` and `info` say of a scan, without what is said of every one."""
     told = [
         finding.message
-        for finding in source_findings(ScanEvidence.of(cast(ScanSource, source)))
+        for finding in source_findings(ScanEvidence(cast(ScanSource, source)))
         if finding.severity != "info"
     ]
     try:

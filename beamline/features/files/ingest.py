@@ -90,7 +90,7 @@ def ingest(
         definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
         frames = len(source.table)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
-        stated = ScanEvidence.of(source)
+        stated = ScanEvidence(source)
         findings = (*parts_joined(stated), *(each for each in stated_used(stated) if each.severity != "info"))
         return Ingested(out, definition, frames, size, invalid, tuple(finding.message for finding in findings))
 

@@ -85,7 +85,7 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
                     of_all |= dict.fromkeys(volume_findings(record))
             return [*of_all]
         with open_scan(scan) as source:
-            evidence = ScanEvidence.of(source)
+            evidence = ScanEvidence(source)
             findings += [*time_order(source), *framestamp_order(source), *source_findings(evidence)]
             findings += views_lit(evidence, deep is not None)
             findings += frames_as_written(source, deep)
@@ -207,7 +207,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     kinds = {kind.name.lower(): source.table.of_kind(kind).size for kind in FrameKind}
     until = clock() + LOOK
     brief = brief_source(source, lambda: clock() > until)
-    findings = source_findings(ScanEvidence.of(brief))
+    findings = source_findings(ScanEvidence(brief))
     attributes = dict(source.attributes)
     if not source.finished:
         dead = not held(source.path) if "status" in attributes else abandoned(source.path)  # our writer has a lock

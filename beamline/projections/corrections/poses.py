@@ -95,6 +95,7 @@ class ScanPoses:
     """Poses of the frames of a scan.
 
     Attributes:
+        table: the poses as the file states them.
         shifts: float64 [frame, 2], (col, row) in pixels of the unbinned detector, NaN where the file states none.
         roll, tilt: float64 [frame], radians.
         frames: int64 [view], the rows that are used.
@@ -105,6 +106,7 @@ class ScanPoses:
         view_of: int64 [frame], which of these views a frame is; -1: none.
     """
 
+    table: PoseTable
     shifts: F64
     roll: F64
     tilt: F64
@@ -175,7 +177,7 @@ def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanP
     every = np.full((n, 4), np.nan)
     every[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
     pivot, sentence = selection.pivot, _sentence(table, shifts)
-    poses = ScanPoses(every[:, :2], every[:, 2], every[:, 3], frames, sentence, pivot, selection.binning)
+    poses = ScanPoses(table, every[:, :2], every[:, 2], every[:, 3], frames, sentence, pivot, selection.binning)
     if table.vectors is None:
         return poses
     return replace(poses, vectors=_of_vectors(table, source, selection), view_of=rows)
@@ -260,10 +262,10 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
     return row_of_frame
 
 
-def require_stated(poses: ScanPoses, source: ScanSource, selection: ScanSelection, view_ids: I64) -> None:
+def require_stated(poses: ScanPoses, source: ScanSource, view_ids: I64) -> None:
     """Raise DataError if views lack a pose."""
-    unknown, table = view_ids[~poses.stated(view_ids)], stated_poses(source, selection)
-    if unknown.size and table is not None:
+    unknown, table = view_ids[~poses.stated(view_ids)], poses.table
+    if unknown.size:
         degrees = np.degrees(source.table.angles[unknown[0]])
         raise DataError(
             f"{table.path} states no pose of {unknown.size} of the {view_ids.size} views chosen of {source.path} "

@@ -167,7 +167,8 @@ def with_tilt(
     from recon.base.views import spread_views
     from recon.prep.tilt import STEEPEST
 
-    source, step = scan.source, selection.step(TiltAndLens)
+    step = selection.step(TiltAndLens)
+    source = scan.source
     step.of(source, selection)  # refuses a cone
     if not step.sought:
         return selection, ""

@@ -20,26 +20,14 @@ _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
 _FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
 
 
-def angles_known(scan: ScanEvidence) -> Iterator[Finding]:
-    """Every projection has a finite angle, in a sense that is certain."""
-    views = scan.table.views
-    unknown = views[~np.isfinite(scan.table.angles[views])]
-    if unknown.size:
-        why = scan.source.attributes.get("angles", "")
-        yield Finding(
-            "error",
-            "angles",
-            f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]})"
-            + (f"; {why}" if why else "")
-            + ". Give them with --angles FILE (degrees, one a line).",
-        )
-    if where := scan.source.attributes.get("angles_reversed"):
-        yield Finding(
-            "warning",
-            "angles",
-            f"The angles of {where} are taken in the reverse sense, as the vector of their axis is negative. "
-            f"--angles-path {where} takes them as they stand; the volume is then the mirror image of this one.",
-        )
+def angles_unknown(scan: ScanEvidence) -> str:
+    """Which projections have no finite angle."""
+    unknown = np.setdiff1d(views := scan.table.views, scan.table.views_with_angles)
+    why = f"; {why}" if (why := scan.source.attributes.get("angles")) else ""
+    return "" if not unknown.size else (
+        f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]}){why}. Give them with "
+        "--angles FILE (degrees, one a line)."
+    )  # fmt: skip
 
 
 def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:

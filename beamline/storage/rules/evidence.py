@@ -51,6 +51,22 @@ class ReferenceGroups(NamedTuple):
         return ReferenceGroups(*(tuple(group for group in groups if group.size) for groups in kept))
 
 
+class Asked(NamedTuple):
+    """What is asked of the evidence of a scan.
+
+    Attributes:
+        accepted: references are used as they are: their faults are warnings.
+        cone: mm from the source to the rotation axis and to the detector, in place of the file's.
+        judged: flags that count in place of the file's.
+        limits: of darks and flats; None: those of a new scan.
+    """
+
+    accepted: bool = False
+    cone: tuple[float, float] | None = None
+    judged: FrameFlags | None = None
+    limits: ReferenceLimits | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class ScanEvidence:
     """What the references and some views of a scan show, beside what its file states.
@@ -61,29 +77,20 @@ class ScanEvidence:
     Attributes:
         source: reads the frames.
         table: what each frame was when the evidence was taken.
-        accepted: references are used as they are: their faults are warnings.
-        cone: mm from the source to the rotation axis and to the detector; None for a parallel beam.
-        judged: flags that count in place of the file's.
-        limits: of darks and flats; None: those of a new scan.
     """
 
     source: ScanSource
-    table: FrameTable
-    accepted: bool = False
-    cone: tuple[float, float] | None = None
-    judged: FrameFlags | None = None
-    limits: ReferenceLimits | None = None
+    asked: Asked = field(default_factory=Asked)
+    table: FrameTable = field(init=False)
     _seen: dict[int, FrameStatistics] = field(default_factory=dict)
     _lit: dict[int, bool] = field(init=False, default_factory=dict)
 
-    @classmethod
-    def of(cls, source: ScanSource, limits: ReferenceLimits | None = None) -> ScanEvidence:
-        """The evidence of a scan as its file states it."""
-        return cls(source, source.table, cone=source.cone, limits=limits)
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "table", self.source.table)
 
     def renewed(self) -> ScanEvidence:
         """The evidence with the frames that are recorded by now."""
-        return self if self.source.table is self.table else replace(self, table=self.source.table)
+        return self if self.source.table is self.table else replace(self)
 
     @property
     def in_counts(self) -> bool:
@@ -91,9 +98,14 @@ class ScanEvidence:
         return self.source.quantity == "counts"
 
     @property
+    def cone(self) -> tuple[float, float] | None:
+        """mm from the source to the rotation axis and to the detector; None for a parallel beam."""
+        return self.source.cone if self.asked.cone is None else self.asked.cone
+
+    @property
     def flags(self) -> FrameFlags | None:
         """Flags of all frames, those that count; None: there are none."""
-        return self.table.flags if self.judged is None else self.judged
+        return self.table.flags if self.asked.judged is None else self.asked.judged
 
     # References, by groups
 
@@ -110,7 +122,7 @@ class ScanEvidence:
     @property
     def used(self) -> ReferenceGroups:
         """The references that correct the views."""
-        return self.taken if self.accepted else self.good
+        return self.taken if self.asked.accepted else self.good
 
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
@@ -123,7 +135,8 @@ class ScanEvidence:
             flats = [group for group in self.taken.flats if start <= group[0] < end]
             seen, views = tuple(self._readable(group) for group in flats), self.table.views_of(start, end)
             if flats or not self.taken.flats:
-                found |= dict.fromkeys(judge(Evidence((*darks, *seen), self._views_beside(views, flats)), self.limits))
+                shown = Evidence((*darks, *seen), self._views_beside(views, flats))
+                found |= dict.fromkeys(judge(shown, self.asked.limits))
         rows = {row for finding in found for row in finding.frames}
         good = {self.table.kind(row) for groups in self.taken for group in groups for row in group if row not in rows}
         return tuple(

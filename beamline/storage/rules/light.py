@@ -1,9 +1,10 @@
-"""Light: views and references must be of one light, and each view of one scale; what else explains their counts."""
+"""Light: good references, of one light with the views, each of one scale; what else explains their counts."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,28 @@ BELOW, OF_VIEWS = (
 )  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
 MORE_LIGHT, HIGHER = 0.1, 0.01  # of flats and darks, shares of the light: examples of what they do where no air is
 """Limits, each with its reason."""
+
+
+def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
+    """Flats are lit, complete and even, and darks are dark; a faulty group is left out if there is a good one.
+
+    An error where all groups of a kind are bad, a warning for others that have a fault, and for all that are accepted.
+    """
+    for finding in scan.findings:
+        message = finding.message
+        if finding.frames:
+            name = f"{scan.table.kind(finding.frames[0]).name.lower()}s"
+            if scan.asked.accepted:
+                message = f"--references accept: {message}"
+            elif finding.severity == "error":
+                message += (
+                    f" It must not be reconstructed: take new {name}, or give others with --{name}; `beamline recon "
+                    "--references accept` uses these as they are."
+                )
+            else:
+                message += f" The other {name} are used instead."
+        severity = "warning" if scan.asked.accepted else finding.severity
+        yield replace(finding, severity=severity, rule="bad-references", message=message)
 
 
 def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
@@ -128,14 +151,8 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
             f"{light:.4g} of light in the flats), though light only adds: the darks are too high. Were they taken with "
             "light, with another gain or exposure, or stored as sums of frames? Give --darks of the views' settings."
         )
-        sentence += "" if scan.accepted else " --references accept uses these."
-        yield Finding("warning" if scan.accepted else "error", "light", sentence)
-
-
-def _middle(scan: ScanEvidence) -> slice:
-    """Rows about the middle, in which noise is looked at."""
-    middle = scan.source.shape[0] // 2
-    return slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
+        sentence += "" if scan.asked.accepted else " --references accept uses these."
+        yield Finding("warning" if scan.asked.accepted else "error", "light", sentence)
 
 
 def _change(scan: ScanEvidence) -> float:
@@ -189,7 +206,9 @@ def _noise_ratio(scan: ScanEvidence) -> float:
     """
     views = spread(scan.table.views, VIEWS)
     taken = [np.concatenate(scan.used.darks), spread(max(scan.used.flats, key=len), VIEWS), views]
-    darks, flats, seen = (read_known(scan.source, some, _middle(scan)).astype(np.float32) for some in taken)
+    middle = scan.source.shape[0] // 2
+    rows = slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
+    darks, flats, seen = (read_known(scan.source, some, rows).astype(np.float32) for some in taken)
     if len(flats) < LEAST_FLATS:
         return 0.0
     light = flats.mean(axis=0) - darks.mean(axis=0)
@@ -299,15 +318,10 @@ def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
     return share if np.ptp(flats) < most and share <= 1 + DRIFT else 0.0
 
 
-def one_energy(scan: ScanEvidence) -> Iterator[Finding]:
-    """All views were taken at one energy, as a volume requires."""
-    if (energies := scan.table.energies) is None:
-        return
-    of_views = energies[scan.table.views]
-    if len(parts := frames_by_energy(of_views)) > 1:
-        yield Finding(
-            "error",
-            "energies",
-            f"The views were taken at {len(parts)} energies: {in_words(of_views)}; a volume needs one. Choose it, such "
-            f"as --frames energy={parts[0][0]:.6g}, which leaves out all frames of others.",
-        )
+def several_energies(scan: ScanEvidence) -> str:
+    """The energies at which views were taken, of which a volume requires one."""
+    energies = np.zeros(0) if scan.table.energies is None else scan.table.energies[scan.table.views]
+    return "" if len(parts := frames_by_energy(energies)) < 2 else (
+        f"The views were taken at {len(parts)} energies: {in_words(energies)}; a volume needs one. Choose it, such "
+        f"as --frames energy={parts[0][0]:.6g}, which leaves out all frames of others."
+    )  # fmt: skip

@@ -55,12 +55,6 @@ def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
     )
 
 
-def pixels_as_labelled(scan: ScanEvidence) -> Iterator[Finding]:
-    """Numbers are of the type that the file states."""
-    if wrapped := scan.source.attributes.get("pixels"):
-        yield Finding("warning", "pixels", f"The label of the pixels is wrong or missing: they are {wrapped}.")
-
-
 def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
     """The quantity of the pixels is known: a missing or a second logarithm ruins a volume unnoticed."""
     if scan.source.quantity == "unknown":
@@ -74,16 +68,13 @@ def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
         )
 
 
-def darks_measured(scan: ScanEvidence) -> Iterator[Finding]:
-    """Darks are images of the camera: no two of its pixels read the same without light."""
+def darks_computed(scan: ScanEvidence) -> str:
+    """Darks that are no images of the camera, of which no two pixels read the same without light."""
     darks = sample(scan, FrameKind.DARK) if scan.source.dtype.kind in "ui" else None
-    if darks is not None and darks.min() == darks.max():
-        yield Finding(
-            "info",
-            CONSTANT_DARKS,
-            f"The darks are {darks.min():g} in every pixel looked at: a constant, not what the camera reads without "
-            "light. If its darks were taken, give them with --darks.",
-        )
+    return "" if darks is None or darks.min() < darks.max() else (
+        f"The darks are {darks.min():g} in every pixel looked at: a constant, not what the camera reads without "
+        "light. If its darks were taken, give them with --darks."
+    )  # fmt: skip
 
 
 def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:

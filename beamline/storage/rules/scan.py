@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +16,24 @@ from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
 from beamline.storage.readers.base import ScanSource, TakesTooLongError
 from beamline.storage.rules import Finding, Severity
-from beamline.storage.rules.angles import angles_known, angles_spread
+from beamline.storage.rules.angles import angles_spread, angles_unknown
 from beamline.storage.rules.angles_shown import angles_shown
 from beamline.storage.rules.evidence import ScanEvidence
-from beamline.storage.rules.light import darks_beside_views, exposures_agree, light_one, one_energy, views_scaled
+from beamline.storage.rules.light import (
+    darks_beside_views,
+    exposures_agree,
+    light_one,
+    references_usable,
+    several_energies,
+    views_scaled,
+)
 from beamline.storage.rules.pixels import (
-    darks_measured,
+    CONSTANT_DARKS,
+    darks_computed,
     numbers_wrapped,
-    pixels_as_labelled,
     pixels_measured,
     quantity_stated,
 )
-from beamline.storage.rules.references import references_usable
 from beamline.storage.rules.stored_order import axis_vertical, sinogram_told, views_first
 from beamline.storage.rules.treatment import frames_flagged
 from drivers.base.frame import FrameKind
@@ -62,13 +69,6 @@ def altered_sentence(source: ScanSource) -> str:
     )
 
 
-def enough_views(scan: ScanEvidence) -> Iterator[Finding]:
-    """A reconstruction needs at least two projections."""
-    n = scan.table.views.size
-    if n < 2:
-        yield Finding("error", "views", f"{n} projections: a reconstruction needs at least 2, a good one hundreds.")
-
-
 def references_present(scan: ScanEvidence) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
     path = Path(scan.source.path).absolute()
@@ -87,24 +87,6 @@ def references_present(scan: ScanEvidence) -> Iterator[Finding]:
                 f"Counts without {name}: give --{name} FILE (or a folder). If the frames were divided by their flats, "
                 f"say --quantity transmission, or line-integrals where their logarithm was taken.{way}",
             )
-
-
-def series_complete(scan: ScanEvidence) -> Iterator[Finding]:
-    """Every trigger has a frame, and no number is missing in a series of files."""
-    missing = scan.source.attributes.get("missing_triggers", 0)
-    if missing:
-        yield Finding("warning", "missing-frames", f"{missing} triggers gave no frame; the file lists them.")
-    numbers = scan.source.attributes.get("missing_numbers", "")
-    if numbers:
-        yield Finding("warning", "missing-frames", f"The series of files leaves out the numbers {numbers}.")
-
-
-def scale_known(scan: ScanEvidence) -> Iterator[Finding]:
-    """The pixel size is known; without it a volume has no scale."""
-    if scan.source.pixel_size_mm is None:
-        yield Finding("info", "pixel-size", "No pixel size: lengths will be in pixels, densities per pixel.")
-    elif not 0 < scan.source.pixel_size_mm < 10:
-        yield Finding("error", "pixel-size", f"A pixel size of {scan.source.pixel_size_mm:g} mm cannot be.")
 
 
 def stated_used(scan: ScanEvidence) -> Iterator[Finding]:
@@ -168,27 +150,58 @@ def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
     yield Finding("error", "parts", f"{sentence}. For this part alone, copy it out of the folder of its run.")
 
 
+@dataclass(frozen=True)
+class Row:
+    """A row of the table for a single finding: told in the sentence that its condition gives, unless that is empty."""
+
+    severity: Severity
+    rule: str
+    sentence: Callable[[ScanEvidence], object]
+
+    def __call__(self, scan: ScanEvidence) -> Iterator[Finding]:
+        if sentence := self.sentence(scan):
+            yield Finding(self.severity, self.rule, str(sentence))
+
+
 Rule = Callable[[ScanEvidence], Iterator[Finding]]
 RULES: tuple[Rule, ...] = (
-    enough_views,
-    angles_known,
+    Row("error", "views", lambda scan: (n := scan.table.views.size) < 2 and (
+        f"{n} projections: a reconstruction needs at least 2, a good one hundreds."
+    )),
+    Row("error", "angles", angles_unknown),
+    Row("warning", "angles", lambda scan: (where := scan.source.attributes.get("angles_reversed")) and (
+        f"The angles of {where} are taken in the reverse sense, as the vector of their axis is negative. "
+        f"--angles-path {where} takes them as they stand; the volume is then the mirror image of this one."
+    )),
     angles_spread,
     angles_shown,
     quantity_stated,
     references_present,
     numbers_wrapped,
-    darks_measured,
+    Row("info", CONSTANT_DARKS, darks_computed),
     exposures_agree,
-    one_energy,
+    Row("error", "energies", several_energies),
     light_one,
     pixels_measured,
-    pixels_as_labelled,
+    Row("warning", "pixels", lambda scan: (wrong := scan.source.attributes.get("pixels")) and (
+        f"The label of the pixels is wrong or missing: they are {wrong}."
+    )),
     views_scaled,
     axis_vertical,
     views_first,
     sinogram_told,
-    series_complete,
-    scale_known,
+    Row("warning", "missing-frames", lambda scan: (n := scan.source.attributes.get("missing_triggers")) and (
+        f"{n} triggers gave no frame; the file lists them."
+    )),
+    Row("warning", "missing-frames", lambda scan: (numbers := scan.source.attributes.get("missing_numbers")) and (
+        f"The series of files leaves out the numbers {numbers}."
+    )),
+    Row("info", "pixel-size", lambda scan: scan.source.pixel_size_mm is None and (
+        "No pixel size: lengths will be in pixels, densities per pixel."
+    )),
+    Row("error", "pixel-size", lambda scan: (size := scan.source.pixel_size_mm) is not None and not 0 < size < 10 and (
+        f"A pixel size of {size:g} mm cannot be."
+    )),
     pixels_square,
     stated_used,
     parts_joined,
@@ -197,7 +210,7 @@ RULES: tuple[Rule, ...] = (
     references_usable,
     darks_beside_views,
     frames_flagged,
-)
+)  # fmt: skip
 """All rules on a scan, in the order in which their findings are told by `validate`, `info` and the preparation."""
 BEFORE_VIEWS: tuple[Rule, ...] = (quantity_stated, references_present, numbers_wrapped, references_usable)
 """Those that a running scan must meet before its views are corrected."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,7 @@ class Treatment:
         views, left_out, halved, masked: bool [frame of the file]: the views. Of these, those with an alarm, which are
             left out; those with a warning, which weigh half; those flagged in a part, where rays weigh less.
         jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
+        parts: regions of frames that are flagged only in some: the frame, the region, and whether it has an alarm.
     """
 
     flags: FrameFlags
@@ -40,6 +41,7 @@ class Treatment:
     halved: Mask
     masked: Mask
     jumps: NDArray[np.int64]
+    parts: Sequence[tuple[int, PixelBox, bool]] = ()
 
     @property
     def in_words(self) -> str:
@@ -66,18 +68,16 @@ def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Trea
     flags = flags.without(MotionCheck.bit)
     if jumped.size:  # what views from the other side show of the jump goes with the views beyond it
         flags = flags.without(OppositeCheck.bit)
-    local = flagged_in_part(flags, shape)
+    boxes = [
+        (frame, box, bool(flags.bits[frame] >> entry.alarm_bit & 1))
+        for i, entry in enumerate(flags.legend)
+        for frame, box in boxes_of(flags, i, entry, shape)
+    ]
+    whole = {frame for frame, box, _ in boxes if box is None}
+    local = flags.flagged & ~np.isin(np.arange(flags.bits.size), list(whole))
+    parts = [(frame, box, alarm) for frame, box, alarm in boxes if box is not None and frame not in whole]
     left_out, halved = (views & some & ~local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
-    return Treatment(flags, views, left_out, halved, views & local, jumped)
-
-
-def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
-    """Whether each frame [frame] is flagged only in some regions."""
-    whole = np.zeros(flags.bits.size, np.bool_)
-    for i, entry in enumerate(flags.legend):
-        for frame, box in boxes_of(flags, i, entry, shape):
-            whole[frame] |= box is None
-    return flags.flagged & ~whole
+    return Treatment(flags, views, left_out, halved, views & local, jumped, parts)
 
 
 def boxes_of(

@@ -16,7 +16,7 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
 from beamline.projections.views import evidence_of
 from beamline.storage.rules.evidence import ScanEvidence
-from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.light import references_usable
 from recon.prep.correct import merge_and_empty
 from tests.beamline.array_source import ArraySource, counted, scan_of
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
@@ -147,7 +147,7 @@ def test_darks_are_dealt_by_exposure(dark: list[float], flat: float) -> None:
     batches = correction.in_batches(frames, np.empty((45, 4, 40), np.float32), 7, lambda n, of: None)
     for found in (correction.at_once(frames), batches):
         np.testing.assert_allclose(found.data, SCAN.line_integrals(), atol=3e-3)
-    assert not list(references_usable(ScanEvidence.of(source)))
+    assert not list(references_usable(ScanEvidence(source)))
 
 
 @pytest.mark.parametrize("flat", [0.1, 0.3])
@@ -158,7 +158,7 @@ def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
     found = correction.at_once(np.flatnonzero(source.table.kinds == 0)).data
     np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
     assert correction.done["flats"].sentence.startswith("Exposures of the views: 0.1")
-    assert not list(references_usable(ScanEvidence.of(source)))
+    assert not list(references_usable(ScanEvidence(source)))
 
 
 def test_spots_are_sought_beside_views_with_the_sample_at_the_same_place(rng: np.random.Generator) -> None:

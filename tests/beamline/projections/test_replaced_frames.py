@@ -136,4 +136,4 @@ def test_a_beam_that_drifts_is_no_sample_in_the_flats(scale: float, drift: float
     light = 1 + drift * (np.linspace(0, 1, VIEWS)[:, None, None] * ramp - 0.3)
     blocks.of(VIEW)[0][:] = 100 + (blocks.of(VIEW)[0] - 100) * light
     blocks.of(FLAT)[1][:] = 100 + (blocks.of(FLAT)[1] - 100) * light[-1]
-    assert not any(finding.frames for finding in ScanEvidence.of(blocks.source()).findings)
+    assert not any(finding.frames for finding in ScanEvidence(blocks.source()).findings)

@@ -102,7 +102,7 @@ def test_a_copy_states_how_its_scan_ended(scan: Callable[[str], Path], tmp_path:
     with open_scan(out) as source:
         assert (source.ending, source.finished) == (ENDINGS[end], True)
         warned = [
-            found.message for found in scan_ended(ScanEvidence.of(source))
+            found.message for found in scan_ended(ScanEvidence(source))
         ]  # as validate, recon and its volume say it
     assert (ENDINGS[end].reason in "".join(warned)) and bool(warned) == (end != "complete")
     assert all(f"with 4 of {VIEWS} views" in message for message in warned)

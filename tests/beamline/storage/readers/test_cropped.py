@@ -64,7 +64,7 @@ def test_regions_of_flags_move_with_the_columns(cols: tuple[int, int], left: int
     source: Any = cropped(_Flagged(), cols)
     assert source.axis_col == 52.5 - cols[0]
     treated = treatment_of(source.table.flags, np.ones(3, np.bool_), source.shape)
-    (box,) = regions_of(treated.flags, source.shape).boxes
+    (box,) = regions_of(treated).boxes
     assert box[2:].tolist() == [left, right] and treated.masked.tolist() == [False, True, False]
 
 

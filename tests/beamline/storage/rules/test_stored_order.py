@@ -38,7 +38,7 @@ def told(
 ) -> list[Finding]:
     source = ArraySource(data, [0] * len(data), angles)
     source.quantity = quantity
-    return list(views_first(ScanEvidence.of(source)))
+    return list(views_first(ScanEvidence(source)))
 
 
 @pytest.mark.parametrize("turn", [np.pi, 2 * np.pi])
