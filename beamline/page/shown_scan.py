@@ -203,7 +203,7 @@ class ShownScan:
         band = range(max(near, 0), min(far + 1, rows))
         try:
             self._correction = self._correction or ScanCorrection(
-                ScanEvidence(self._source), Selection(), lambda _: None, some
+                ScanEvidence(self._source), Selection().of(self._source), lambda _: None, some
             )
             corrected = self._correction.at_once(some, slice(band.start, band.stop))
         except ValueError as error:

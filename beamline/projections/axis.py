@@ -59,10 +59,9 @@ def rotation_axis(
     if axis_col is None and not straight:
         axis_col, axis = _axis_by_views(scan, selection, usable.frames, poses, warn, progress)
     elif axis_col is None:
-        whole = selection.axis_rows
         by = correction
-        if whole is not None:
-            by = ScanCorrection(scan, replace(selection, rows=whole), lambda _: None, usable.frames)
+        if selection.axis_rows is not None:
+            by = ScanCorrection(scan, replace(selection, rows=selection.axis_rows), lambda _: None, usable.frames)
         axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
     check_axis(source, axis_col)
     if selection.axis_col is not None and straight and usable.frames.size >= _FEWEST:

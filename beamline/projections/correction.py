@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,7 +18,7 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import current_scale
 from beamline.projections.open_beam import OpenBeam, Shadow, count_references, foreign_to_lines
 from beamline.projections.read import ViewFilters, ViewReader, reading_memory
-from beamline.projections.selection import ScanSelection, Selection
+from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import ScanSource
@@ -90,7 +90,7 @@ class ScanPlan:
             return self
         if self.beam is None:
             return replace(self, shadow=foreign_to_lines(source, views, read, n))
-        with refused(source):
+        with refused(source, self.preparation):
             return replace(self, shadow=self.beam.shadow(source, views, read.start, n))
 
 
@@ -125,11 +125,12 @@ def survey(scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDAr
 
 
 @contextmanager
-def refused(source: ScanSource, advice: str = "") -> Iterator[None]:
+def refused(source: ScanSource, asked: Preparation) -> Iterator[None]:
     """Turn what is wrong with numbers into a DataError that names the file."""
     try:
         yield
     except UnlitViewsError as error:
+        advice = "" if asked.judged else " (--flags judge leaves out what the monitor finds dark)"
         raise DataError(
             f"{source.path} cannot be corrected: {error}{advice}; if the sample covers these columns, --air none"
         ) from error
@@ -146,10 +147,9 @@ class ScanCorrection:
     """
 
     def __init__(
-        self, scan: ScanEvidence, selection: Selection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
+        self, scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
     ) -> None:
         """Survey the scan; arguments and errors are those of `survey`."""
-        selection = selection.of(scan.source)
         self.plan = survey(scan, selection, warn, views)
         self.rows, self.binning = self.plan.filters.rows, selection.binning
         self._scan, self._source, self._selection = scan, scan.source, selection
@@ -158,16 +158,6 @@ class ScanCorrection:
         self._stream: CorrectionPlan | LinesPlan | None = None  # with the views fed so far
         self._columns: set[tuple[int, int]] = set()  # air columns by which views were corrected
         self._fed = NO_VIEWS
-
-    @property
-    def photons(self) -> Photons | None:
-        """The photon statistics of the pixels; None if they do not count photons or if logarithms are taken."""
-        return self.plan.photons
-
-    @property
-    def done(self) -> dict[str, StepDone]:
-        """What each correction step did, by the name of the step."""
-        return self.plan.done
 
     def at_once(
         self,
@@ -191,7 +181,7 @@ class ScanCorrection:
             self._reader.tell_unlit(frames, usable)
         if not (n := usable.size):
             raise self._reader.no_view()
-        with self._refused():
+        with refused(self._source, self.plan.preparation):
             order, at = _by_angle(self._source.table, usable), usable.astype(np.float64)
             lines, _ = apply(
                 data, at, self.plan.of_rows(rows), usable, progress=lambda done: progress((n + done) // _STEPS, n),
@@ -211,7 +201,7 @@ class ScanCorrection:
         Raises:
             DataError: as `at_once`; photons are counted: their weights would have to be in memory.
         """
-        if self.photons is not None:
+        if self.plan.photons is not None:
             raise DataError(
                 f"{self._source.path}: --noise counts needs all views in memory. Give --noise log, or --bin "
                 f"{2 * self.binning}."
@@ -223,7 +213,7 @@ class ScanCorrection:
         def done(parts: int, before: int) -> None:
             progress(before * frames.size + min(parts * batch, frames.size), passes * frames.size)
 
-        with self._refused():
+        with refused(self._source, self.plan.preparation):
             plan = self.plan.of_rows(None)
             if isinstance(plan, CorrectionPlan):
                 parts, plan = self._with_air_found(parts, plan, lambda n: done(n, 0))
@@ -279,7 +269,7 @@ class ScanCorrection:
         data, usable = self._reader.read(frames, None)
         self._reader.tell_unlit(frames, usable)
         self._fed = np.append(self._fed, usable)
-        with self._refused():
+        with refused(self._source, self.plan.preparation):
             lines, self._stream = self._next(data, usable, self._stream or self.plan.of_rows(None), last)
         if lines is None or not lines.view_ids.size:
             return None
@@ -335,10 +325,6 @@ class ScanCorrection:
     def renewed(self, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorrection:
         """A correction with all references recorded by now; `views` as of `survey`."""
         return ScanCorrection(self._scan.renewed(), self._selection, self._reader.warn, views)
-
-    def _refused(self) -> AbstractContextManager[None]:
-        judged = self.plan.preparation.judged
-        return refused(self._source, "" if judged else " (--flags judge leaves out what the monitor finds dark)")
 
 
 _NOTHING = np.empty((0, 0, 0), np.float32), NO_VIEWS

@@ -123,7 +123,7 @@ def prepare_projections(
     prepared = assemble(scan, selection, projections, geometry, place, usable, warn, buffer is not None)
     prepared = _with_held_out(prepared, correction, view_geometry, others)
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
-    prepared = replace(prepared, done={**correction.done, **tilt, **view_geometry.done})
+    prepared = replace(prepared, done={**correction.plan.done, **tilt, **view_geometry.done})
     prepared = _after_scan_steps(source, selection, prepared, phases)
     prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.ordinary, selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
@@ -148,8 +148,7 @@ def _with_held_out(
 
 def require_usable(source: ScanSource, selection: Selection) -> None:
     """Raise the errors of `prepare_projections` that can be found without reading a frame."""
-    selected = selection.of(source)
-    _usable(evidence_of(source, selected), selected, lambda sentence: None)
+    _usable(evidence_of(source, selection), selection.of(source), lambda sentence: None)
 
 
 def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:

@@ -199,11 +199,6 @@ class ViewReader:
     warn: Warn
     named: set[int] = field(default_factory=set)
 
-    @property
-    def source(self) -> ScanSource:
-        """What reads the frames."""
-        return self.scan.source
-
     def read(
         self,
         frames: NDArray[np.int64],
@@ -212,7 +207,7 @@ class ViewReader:
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Pixels [frame, row, col] of the frames that hold a finite one, have light and are not damaged, and these
         frames; of some binned rows, of all for None."""
-        source = self.source
+        source = self.scan.source
         data = read_binned(source, frames, self.filters.read(rows), self.filters.binning, progress)
         lost = tell_damaged(source, self.selection, frames, self.warn)
         data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
@@ -242,9 +237,9 @@ class ViewReader:
         copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
         if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
             self.warn(
-                f"{count(len(copies), 'view')} of {self.source.table.views.size} (frames {spans(copies)}) hold the "
-                "pixels of the view before: the camera or its driver gave an image twice. Their angles are then wrong "
-                "for what they show: leave them out with --views or --flags judge, or repeat them."
+                f"{count(len(copies), 'view')} of {self.scan.source.table.views.size} (frames {spans(copies)}) hold "
+                "the pixels of the view before: the camera or its driver gave an image twice. Their angles are then "
+                "wrong for what they show: leave them out with --views or --flags judge, or repeat them."
             )
 
     def tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
@@ -252,11 +247,11 @@ class ViewReader:
         unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(self.scan.known_unlit, np.int64))
         if (news := np.setdiff1d(unlit, sorted(self.named))).size == 0:
             return
-        gap = f", and{gap_text}" if (gap_text := gap_sentence(self.source, asked, lit)) else ""
+        gap = f", and{gap_text}" if (gap_text := gap_sentence(self.scan.source, asked, lit)) else ""
         self.named.update(news.tolist())
         self.warn(
-            f"{count(news.size, 'view')} of {self.source.table.views.size} (frames {spans(news.tolist())}) have no "
-            "light: the shutter was closed, the beam was gone, or the file was never written there. They are left "
+            f"{count(news.size, 'view')} of {self.scan.source.table.views.size} (frames {spans(news.tolist())}) have "
+            "no light: the shutter was closed, the beam was gone, or the file was never written there. They are left "
             f"out{gap}."
         )
 
@@ -269,6 +264,6 @@ class ViewReader:
             "their flats already, say --quantity transmission, or line-integrals."
         )
         return NoViewError(
-            f"{self.source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have no "
-            f"light, or differ from their checksums.{beside_flats}"
+            f"{self.scan.source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have "
+            f"no light, or differ from their checksums.{beside_flats}"
         )

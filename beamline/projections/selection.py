@@ -115,10 +115,6 @@ class ScanSelection(Selection):
             raise ConfigError(f"--bin {n} does not fit into {end - first} rows of {width} columns.")
         object.__setattr__(self, "rows", (first, first + (end - first) // n * n))
 
-    def of(self, source: ScanSource) -> ScanSelection:
-        """It is resolved already."""
-        return self
-
     @property
     def detector_rows(self) -> slice:
         """The rows that are read."""

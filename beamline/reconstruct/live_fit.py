@@ -145,7 +145,7 @@ class ScanFollower:
             return False
         refuse(self.source, blockers)
         self._correction = ScanCorrection(self._scan, self._selection, self._warn)
-        self._tell(self._correction.done)
+        self._tell(self._correction.plan.done)
         return True
 
     def _look_for_axis(self, views: NDArray[np.int64], ended: bool) -> None:
@@ -370,7 +370,7 @@ class ScanFollower:
         geometry, axis = places.of(projections.view_ids), (axis_col, self._axis.estimate)
         compare_with_flats(self._scan, selection, projections, self._warn, refused=False)
         prepared = assemble(self._scan, selection, projections, geometry, axis, usable, self._warn)
-        done = {**self._correction.done, **places.done}
+        done = {**self._correction.plan.done, **places.done}
         for step in in_order(selection):
             if isinstance(step, PlaceStep):
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved

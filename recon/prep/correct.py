@@ -255,20 +255,8 @@ class CorrectionPlan:
         Raises:
             UnlitViewsError: the air columns of some views are dark; it has their numbers.
         """
-        settings, columns = self.settings, self.air_columns
-        views = _no_views(self.dark.shape, self.photons is not None) if views is None else views
-        light = air_light(views.data, *columns)
-        air = light.mean(axis=1)
-        unlit = views.view_ids[~(light.min(axis=1) > settings.floor)]
-        if unlit.size:
-            raise UnlitViewsError(
-                f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
-                f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
-            )
-        views.data[...] /= light[:, None]
-        beam = None if views.beam is None else views.beam * light[:, None]
-        views, spots = self.spots.feed(replace(views, air=air, beam=beam), last, progress, order)
-        floored = 0
+        settings, columns, floored = self.settings, self.air_columns, 0
+        views, spots = self.spots.feed(views and self._levelled(views), last, progress, order)
         for v, view in enumerate(views.data):
             if views.beam is not None:
                 self._likelihood(view, views.beam[v])
@@ -283,6 +271,19 @@ class CorrectionPlan:
             views.data, views.view_ids, floored / live, views.air, self.masked, columns, replaced, views.beam,
             views.unmeasured, spots.left,
         ), replace(self, spots=spots)  # fmt: skip
+
+    def _levelled(self, views: Transmission) -> Transmission:
+        """The views divided by their air, in place."""
+        light, columns = air_light(views.data, *self.air_columns), self.air_columns
+        unlit = views.view_ids[~(light.min(axis=1) > self.settings.floor)]
+        if unlit.size:
+            raise UnlitViewsError(
+                f"no beam in {unlit.size} of {len(light)} views ({unlit[:8].tolist()} ...): the air columns, "
+                f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
+            )
+        views.data[...] /= light[:, None]
+        beam = None if views.beam is None else views.beam * light[:, None]
+        return replace(views, air=light.mean(axis=1), beam=beam)
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
@@ -347,11 +348,6 @@ def _check_views(counts: NDArray[np.generic], positions: NDArray[np.float64], sh
         )
 
 
-def _no_views(shape: tuple[int, ...], counted: bool = False) -> Transmission:
-    none, empty = np.empty((0, *shape), np.float32), np.empty(0, np.int64)
-    return Transmission(none, empty, empty, np.empty(0, np.float32), none if counted else None)
-
-
 @dataclass(frozen=True, eq=False)
 class LinesPlan:
     """The plan of views that are line integrals already, which is used as a `CorrectionPlan` is.
@@ -412,7 +408,6 @@ class LinesPlan:
         order: NDArray[np.intp] | None = None,
     ) -> tuple[Projections, LinesPlan]:
         """As of a `CorrectionPlan`."""
-        views = _no_views(self.masked.shape) if views is None else views
         views, spots = self.spots.feed(views, last, progress, order)
         replaced = float(views.repaired.sum()) / max(views.data.size, 1)
         return Projections(

@@ -45,7 +45,7 @@ class Transmission:
     unmeasured: I64 = field(default_factory=NO_RUNS.copy)
     unseen: Mask | None = None
 
-    def __getitem__(self, part: slice | NDArray[np.intp]) -> Transmission:
+    def __getitem__(self, part: slice | NDArray[np.intp] | list[int]) -> Transmission:
         """Some of the views."""
         ids, beam = self.view_ids[part], None if self.beam is None else self.beam[part]
         runs = self.unmeasured[np.isin(self.unmeasured[:, 0], ids)]
@@ -80,7 +80,7 @@ class SpotFilter:
 
     def feed(
         self,
-        views: Transmission,
+        views: Transmission | None,
         last: bool = True,
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
@@ -88,12 +88,15 @@ class SpotFilter:
         """The waiting view and these, their spots filled in place; and the filter of the views that follow.
 
         Args:
-            views: the next ones; without `last` the newest then waits.
+            views: the next ones; None: there are none after the waiting one.
+            last: no view comes after these; else the newest then waits.
             progress: how many views are done, after each.
             order: [view], where each view has its neighbours, beside it; all views are there, and none waits. None:
                 their neighbours are those before and after.
         """
-        views = views if self.waiting is None else self.waiting.and_then(views)
+        if self.waiting is not None:
+            views = self.waiting[[0]] if views is None else self.waiting.and_then(views)
+        assert views is not None
         total, before, left = len(views.data), self.before, self.left
         n, order = total if last else max(total - 1, 0), np.arange(total) if order is None else order
         here = self.root(views.data[order[0]]) if n else None

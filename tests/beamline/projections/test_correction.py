@@ -27,7 +27,7 @@ PLAIN = Selection(steps=(Air("none"),))
 
 
 def correction_of(source: Any, selection: Selection, warn: Callable[[str], None] = pytest.fail) -> ScanCorrection:
-    return ScanCorrection(evidence_of(source, selection), selection, warn)
+    return ScanCorrection(evidence_of(source, selection), selection.of(source), warn)
 
 
 @pytest.mark.parametrize("air", ["auto", "none", "3,3"])
@@ -89,10 +89,10 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     errors = []
     for way in ("groups", "dynamic"):
         correction = correction_of(source, Selection(steps=(Preparation(flat_fields=way),)))
-        assert bool(correction.done["flats"].sentence) is (way == "dynamic")
+        assert bool(correction.plan.done["flats"].sentence) is (way == "dynamic")
         errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
     assert errors[1] < 0.3 * errors[0]
-    assert "components of their changes" in correction.done["flats"].sentence
+    assert "components of their changes" in correction.plan.done["flats"].sentence
     few = scan_of(data[:1], data[1:4], data[13:], SCAN.angles, np.float32)
     with pytest.raises(ConfigError, match="--flat-fields"):
         correction_of(few, Selection(steps=(Preparation(flat_fields="dynamic"),)), lambda _: None)
@@ -113,7 +113,10 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
         correction = correction_of(source, selection)
         off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
     assert off[0] > 0.5 and off[1] < 0.01
-    assert correction.done["flats"].sentence == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
+    assert (
+        correction.plan.done["flats"].sentence
+        == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
+    )
     current[2] = np.nan
     source.state(currents=current)
     with pytest.raises(ConfigError, match="views or flats"):
@@ -157,7 +160,7 @@ def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
     correction = correction_of(source, PLAIN)
     found = correction.at_once(np.flatnonzero(source.table.kinds == 0)).data
     np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
-    assert correction.done["flats"].sentence.startswith("Exposures of the views: 0.1")
+    assert correction.plan.done["flats"].sentence.startswith("Exposures of the views: 0.1")
     assert not list(references_usable(ScanEvidence(source)))
 
 

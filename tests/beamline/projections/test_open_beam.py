@@ -38,7 +38,7 @@ def scan(photons: float, n_flats: int = 20, n_darks: int = 10) -> ArraySource:
 
 def correction_of(source: Any, *steps: PrepStep, **chosen: Any) -> ScanCorrection:
     selection = replace(PLAIN, **chosen).with_steps(*steps)
-    return ScanCorrection(evidence_of(source, selection), selection, pytest.fail)
+    return ScanCorrection(evidence_of(source, selection), selection.of(source), pytest.fail)
 
 
 def test_line_integrals_and_weights_are_those_of_counts() -> None:
@@ -68,10 +68,10 @@ def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
 ])  # fmt: skip
 def test_counts_where_they_are_few_or_asked_for(photons: float, noise: Noise, counted: bool) -> None:
     found = correction_of(scan(photons), Preparation(noise=noise))
-    assert (found.photons is not None) == counted
-    if found.photons is not None:
-        assert found.photons.gain == pytest.approx(GAIN, rel=0.1)
-        assert found.photons.variance**0.5 == pytest.approx(READOUT, rel=0.1)
+    assert (found.plan.photons is not None) == counted
+    if found.plan.photons is not None:
+        assert found.plan.photons.gain == pytest.approx(GAIN, rel=0.1)
+        assert found.plan.photons.variance**0.5 == pytest.approx(READOUT, rel=0.1)
 
 
 @pytest.mark.parametrize(("binning", "frames", "of"), [(2, 1, 4), (1, 5, 5)])
@@ -83,9 +83,9 @@ def test_binned_pixels_and_means_of_frames_have_the_photons_of_all(
     source = scan(20)
     source.frames_per_view = frames
     found = correction_of(source, Preparation(noise="counts", gain=gain), binning=binning)
-    assert found.photons is not None
-    assert found.photons.gain == pytest.approx(GAIN / of, rel=0.1)
-    assert found.photons.variance == pytest.approx(READOUT**2 / of, rel=0.2)
+    assert found.plan.photons is not None
+    assert found.plan.photons.gain == pytest.approx(GAIN / of, rel=0.1)
+    assert found.plan.photons.variance == pytest.approx(READOUT**2 / of, rel=0.2)
 
 
 def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
@@ -128,4 +128,4 @@ def test_dark_corners_of_the_frame_are_no_lack_of_photons(gain: float) -> None:
     frames = np.stack([*counts])
     darks = rng.normal(DARK, 2, (6, rows, cols)).round()
     correction = correction_of(scan_of(darks, frames[:6], frames[6:], SCAN.angles, np.float32))
-    assert window.mean() < 0.5 and correction.photons is None
+    assert window.mean() < 0.5 and correction.plan.photons is None

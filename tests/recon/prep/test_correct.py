@@ -302,7 +302,8 @@ def in_batches(
         batch = slice(first, end)
         lines, following = apply(counts[batch], at[batch], following, np.arange(first, end), last=end == len(counts))
         parts.append(lines)
-        following.line_integrals(None)  # which changes nothing
+        if following.spots.waiting is not None:
+            following.line_integrals(None)  # which changes nothing
     assert following.spots.waiting is None
     return merge_and_empty(parts)
 

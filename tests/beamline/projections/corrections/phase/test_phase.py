@@ -35,7 +35,7 @@ def _source() -> ArraySource:
 
 
 def _correction(selection: Selection) -> ScanCorrection:
-    return ScanCorrection(evidence_of(_source(), selection), selection, pytest.fail)
+    return ScanCorrection(evidence_of(_source(), selection), selection.of(_source()), pytest.fail)
 
 
 def test_batches_and_views_on_disk_are_the_views_at_once() -> None:
