@@ -34,7 +34,6 @@ from recon.prep.correct import (
     apply,
     merge_and_empty,
 )
-from recon.prep.counts import Photons
 
 _COPIES = 3  # float32 copies of the views that are corrected at once
 _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of spots
@@ -56,11 +55,6 @@ class ScanPlan:
     beam: OpenBeam | None
     preparation: Preparation
     shadow: Shadow | None = None
-
-    @property
-    def photons(self) -> Photons | None:
-        """The photon statistics of the pixels; None if they do not count photons or if logarithms are taken."""
-        return None if self.beam is None else self.beam.photons
 
     @property
     def done(self) -> dict[str, StepDone]:
@@ -85,7 +79,7 @@ class ScanPlan:
 
     def in_shadow(self, source: ScanSource, views: NDArray[np.int64]) -> ScanPlan:
         """The plan with what stands in the beam of all views of a finished scan, as some of these show it."""
-        read, n = self.filters.read(None), self.filters.binning
+        read, n = self.filters.read(None), self.filters.selection.binning
         if not source.finished:
             return self
         if self.beam is None:
@@ -115,7 +109,7 @@ def survey(scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDAr
     if source.table.altered.any():
         warn(altered_sentence(source))
     if source.quantity == "counts":
-        beam = OpenBeam.of(scan, selection, filters.read(None), filters.rows, warn)
+        beam = OpenBeam.of(scan, selection, filters.read(None), warn)
     elif asked.noise == "counts":
         raise ConfigError(f"--noise counts: {source.path} contains line integrals, not counts. Leave it out.")
     elif asked.by_current:
@@ -151,7 +145,7 @@ class ScanCorrection:
     ) -> None:
         """Survey the scan; arguments and errors are those of `survey`."""
         self.plan = survey(scan, selection, warn, views)
-        self.rows, self.binning = self.plan.filters.rows, selection.binning
+        self.rows, self.binning = selection.detector_rows, selection.binning
         self._scan, self._source, self._selection = scan, scan.source, selection
         references = None if self.plan.beam is None else self.plan.beam.references
         self._reader = ViewReader(scan, selection, self.plan.filters, references, warn)
@@ -201,7 +195,7 @@ class ScanCorrection:
         Raises:
             DataError: as `at_once`; photons are counted: their weights would have to be in memory.
         """
-        if self.plan.photons is not None:
+        if self.plan.beam is not None and self.plan.beam.photons is not None:
             raise DataError(
                 f"{self._source.path}: --noise counts needs all views in memory. Give --noise log, or --bin "
                 f"{2 * self.binning}."

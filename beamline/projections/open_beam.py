@@ -61,12 +61,11 @@ class OpenBeam:
     done: dict[str, StepDone]
 
     @classmethod
-    def of(cls, scan: ScanEvidence, selection: ScanSelection, read: slice, rows: slice, warn: Warn) -> OpenBeam:
+    def of(cls, scan: ScanEvidence, selection: ScanSelection, read: slice, warn: Warn) -> OpenBeam:
         """The open beam from the reference frames in the file; a faulty group is used only if there is no other.
 
         Args:
             read: detector rows that are read.
-            rows: those of them that are wanted.
             warn: takes a sentence on damaged frames, on spots, and on parts of the scan without flats.
 
         Raises:
@@ -81,7 +80,7 @@ class OpenBeam:
             references = with_dynamic_flats(scan, references, read, selection)
         tell_damaged(scan.source, selection, np.concatenate([*scan.used.darks, *scan.used.flats]), warn)
         warn_of_parts_without_flats(scan, references, warn)
-        photons = photons_of(scan, references, rows, selection)
+        photons = photons_of(scan, references, selection)
         settings = CorrectionSettings(
             asked.floor,
             asked.hot_threshold,
@@ -140,7 +139,7 @@ _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's 
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
 
 
-def photons_of(scan: ScanEvidence, references: References, rows: slice, selection: ScanSelection) -> Photons | None:
+def photons_of(scan: ScanEvidence, references: References, selection: ScanSelection) -> Photons | None:
     """Photon statistics of the (binned) pixels of a scan; None if logarithms are to be taken.
 
     The gain is that of the selection, or the photon transfer of the largest group of flats. The readout noise is that
@@ -153,7 +152,7 @@ def photons_of(scan: ScanEvidence, references: References, rows: slice, selectio
     model = selection.step(Preparation)
     if model.noise == "log":
         return None
-    source, binning = scan.source, selection.binning
+    source, binning, rows = scan.source, selection.binning, selection.detector_rows
     first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
     middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
     spoilt = spoilt_frames(source, not model.uses_flags)

@@ -288,18 +288,11 @@ def assemble(
         measured=~unknown if unknown.any() else None,
         shares_of=shares_of if on_disk and regions.mark(ids) else None,
         stretch=_stretch(source, geometry, resampled=resampling is not None),
-        sample_radius=_stated_radius(source, selection),
+        sample_radius=None if selection.sample_width is None else selection.sample_width / 2,
     )
     report_defects(prepared, first, binning, warn)
     warn_of_the_field(scan, selection, prepared.ordinary, warn)
     return prepared
-
-
-def _stated_radius(source: ScanSource, selection: ScanSelection) -> float | None:
-    """Half the width of the sample in mm (px where the pixel size is unknown), as asked for or as the file says."""
-    stated = source.attributes.get("sample_diameter_mm") if selection.pixel_size_mm is not None else None
-    width = stated if selection.sample_width is None else selection.sample_width
-    return None if width is None else float(width) / 2
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:

@@ -119,25 +119,20 @@ class ViewFilters:
     Attributes:
         filters: in their order.
         done: what each step on views does, by name.
-        rows: detector rows that are wanted, whole bins.
-        binning: pixels averaged per side.
-        height: rows of the detector.
+        selection: rows that are wanted, and binning.
     """
 
     filters: tuple[ViewFilter, ...]
     done: dict[str, StepDone]
-    rows: slice
-    binning: int
-    height: int
+    selection: ScanSelection
 
     @classmethod
     def of(cls, source: ScanSource, selection: ScanSelection) -> ViewFilters:
         """The filters of a selection.
 
         Raises:
-            ConfigError: rows or binning that do not fit the detector, or filters of counted photons.
+            ConfigError: filters of counted photons.
         """
-        rows = selection.detector_rows
         outcomes = {step.name: step.on(source, selection) for step in in_order(selection) if isinstance(step, ViewStep)}
         filters = tuple(each for each, _ in outcomes.values() if each is not None)
         if filters and selection.step(Preparation).noise == "counts":
@@ -145,7 +140,7 @@ class ViewFilters:
                 f"{filters[-1].mixes} neighbouring pixels, so that --noise counts has no likelihood for them."
             )
         done = {name: each for name, (_, each) in outcomes.items()}
-        return cls(filters, done, rows, selection.binning, source.shape[0])
+        return cls(filters, done, selection)
 
     def read(self, rows: slice | None) -> slice:
         """Detector rows to read for some binned rows (None: all), with the margin that filters need."""
@@ -154,7 +149,8 @@ class ViewFilters:
     def within(self, rows: slice | None) -> slice:
         """The same rows, binned, as a slice of what is read for all rows."""
         first, part = self.read(None).start, self.read(rows)
-        return slice((part.start - first) // self.binning, (part.stop - first) // self.binning)
+        n = self.selection.binning
+        return slice((part.start - first) // n, (part.stop - first) // n)
 
     def apply(self, views: Projections, rows: slice | None) -> Projections:
         """Apply all filters to the views, and return the requested rows."""
@@ -167,13 +163,13 @@ class ViewFilters:
 
     def _widened(self, rows: slice | None) -> tuple[slice, slice]:
         """Detector rows to read, and which of them are wanted, in binned rows."""
-        n, reach = self.binning, sum(each.reach for each in self.filters)
-        first, end = self.rows.start, self.rows.stop
+        n, reach = self.selection.binning, sum(each.reach for each in self.filters)
+        first, end = self.selection.detector_rows.start, self.selection.detector_rows.stop
         if rows is not None:
             start, stop, _ = rows.indices((end - first) // n)
             first, end = first + start * n, first + stop * n
         above = min(reach, first // n)
-        below = min(reach, (self.height - end) // n)
+        below = min(reach, (self.selection.shape[0] - end) // n)
         return slice(first - above * n, end + below * n), slice(above, above + (end - first) // n)
 
 
@@ -208,7 +204,7 @@ class ViewReader:
         """Pixels [frame, row, col] of the frames that hold a finite one, have light and are not damaged, and these
         frames; of some binned rows, of all for None."""
         source = self.scan.source
-        data = read_binned(source, frames, self.filters.read(rows), self.filters.binning, progress)
+        data = read_binned(source, frames, self.filters.read(rows), self.selection.binning, progress)
         lost = tell_damaged(source, self.selection, frames, self.warn)
         data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
         alive = np.isfinite(data).any(axis=(1, 2))

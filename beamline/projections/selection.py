@@ -85,14 +85,17 @@ class Selection:
                 f"{whose}: a pixel size of {size_mm * 1e3:.4g} um; expected {low:g} to {high:g} um. Give the right one "
                 "with --pixel-size-um."
             )
-        stated = {"pixel_size_mm": size_mm, "cone": self.cone or source.cone}
+        width = source.attributes.get("sample_diameter_mm") if size_mm is not None else None
+        width = width if self.sample_width is None else self.sample_width
+        cone, width = self.cone or source.cone, None if width is None else float(width)
+        stated = {"pixel_size_mm": size_mm, "cone": cone, "sample_width": width}
         kept = {each.name: getattr(self, each.name) for each in fields(Selection)}
         return ScanSelection(**{**kept, **stated}, asked=self, shape=source.shape, path=source.path)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScanSelection(Selection):
-    """What is selected of one scan: where the selection leaves pixel size and cone open, those of its file.
+    """What is selected of one scan: where pixel size, cone and width of the sample are left open, those of its file.
 
     Attributes:
         rows: those that are read, whole bins.

@@ -97,10 +97,6 @@ class FollowedViews:
         chosen = parse_views(self.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[chosen])]
 
-    def template(self, axis_col: float) -> Geometry:
-        """The geometry of one view at 0 rad, with the axis in this column of the full detector."""
-        return self.selection.geometry(axis_col, np.zeros(1))
-
     def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, StepDone]:
         """The geometry of views with the width of their rays, and what was done about that."""
         geometry = self.selection.geometry(axis_col, self.source.table.angles[view_ids])

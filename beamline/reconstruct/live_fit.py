@@ -43,7 +43,7 @@ from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.in_time import LastRound
 from recon.splatting.stream import StreamingFit
 
-_NONE = np.empty(0, np.int64)
+_NONE, _ONE_VIEW = np.empty(0, np.int64), np.zeros(1)  # rows of the file; rad
 BATCH_VIEWS = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
 _BEHIND = 0.5  # steps a view: with fewer, FBP shows more of the views (tests/bench/test_live_accuracy.py)
@@ -158,7 +158,7 @@ class ScanFollower:
         if abs(self.axis_col - before) > _AXIS_MOVES:
             self._fit = None
         else:
-            self._fit.move_axis(self.views.template(self.axis_col).axis_col)
+            self._fit.move_axis(self._selection.geometry(self.axis_col, _ONE_VIEW).axis_col)
 
     def _feed_batch(self, views: NDArray[np.int64], ended: bool) -> None:
         """Feed the fit with the next views, all of one part of the file, as each part has its own references."""
@@ -228,7 +228,7 @@ class ScanFollower:
         options, again = self._options, bool(self._history)
         now = self._clock.now()
         self._sink(ReconStarted(self.source.path, options.method.name, self.views.n, axis_col, again, time=now))
-        fit = options.streaming.stream(self.views.template(axis_col), options.seed, self._clock.now)
+        fit = options.streaming.stream(self._selection.geometry(axis_col, _ONE_VIEW), options.seed, self._clock.now)
         for batch in self._cursor.batches:
             fit.add_views(batch.data, self.views.angles(axis_col, batch.view_ids))
         self._cursor = replace(self._cursor, newest=None)  # the next views bring it again
