@@ -16,7 +16,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import current_scale
-from beamline.projections.open_beam import OpenBeam, Shadow, count_references, foreign_to_lines
+from beamline.projections.open_beam import OpenBeam, Shadow, foreign_to_lines
 from beamline.projections.read import ViewFilters, ViewReader, reading_memory
 from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
@@ -239,7 +239,7 @@ class ScanCorrection:
                 usable.append(some)
                 plan = plan.surveyed(plan.transmission(data, some.astype(np.float64), some))
             done(n)
-        return usable, plan.settled()
+        return usable, replace(plan, settings=replace(plan.settings, air=plan.air_columns))
 
     def _next(
         self, data: NDArray[Any], frames: NDArray[np.int64], plan: Plan, last: bool
@@ -275,7 +275,8 @@ class ScanCorrection:
 
         It keeps waiting, because all its spots show only beside both neighbours.
         """
-        return None if self._stream is None else self._next(*_NOTHING, self._stream, last=True)[0]
+        none = np.empty((0, 0, 0), np.float32)
+        return None if self._stream is None else self._next(none, NO_VIEWS, self._stream, last=True)[0]
 
     def open_beam(self, most: int) -> NDArray[np.float32]:
         """Line integrals [frame, row, col] of at most so many flats that follow one another, corrected as views are.
@@ -302,8 +303,8 @@ class ScanCorrection:
             return True
         if self.plan.beam is None or self._stream is None:
             return False
-        more = count_references(self._source) != self.plan.beam.n_references
-        return more or self._columns != {self._stream.air_columns}
+        then, now = ((table.darks.size, table.flats.size) for table in (self._scan.table, self._source.table))
+        return then != now or self._columns != {self._stream.air_columns}
 
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
         """Whether an object stands in the beam of these views of a finished scan that `feed` took for sample."""
@@ -319,9 +320,6 @@ class ScanCorrection:
     def renewed(self, views: NDArray[np.int64] = NO_VIEWS) -> ScanCorrection:
         """A correction with all references recorded by now; `views` as of `survey`."""
         return ScanCorrection(self._scan.renewed(), self._selection, self._reader.warn, views)
-
-
-_NOTHING = np.empty((0, 0, 0), np.float32), NO_VIEWS
 
 
 def line_integrals_of(scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64]) -> Projections:

@@ -34,9 +34,9 @@ from recon.prep.unmeasured import foreign_rows
 
 _LEAST_VIEWS, SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least and at most, and rows at a time
 
+# bool [row, col], objects in the beam of all views; bool [row], rows in which objects come and go that are not of the
+# sample (`foreign_rows`).
 Shadow = tuple[Mask, Mask]
-"""bool [row, col], objects in the beam of all views; bool [row], rows in which objects come and go that are not of the
-sample (`foreign_rows`)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,6 @@ class OpenBeam:
         photons: how pixels count photons; None: logarithms are taken.
         light: float64 [frame], by how much that of a view grows to the usual exposure and, where it is asked for, the
             median ring current; None: all views are alike.
-        n_references: darks and flats that the file had.
         done: what flats, defects and noise came to, by these names.
     """
 
@@ -57,7 +56,6 @@ class OpenBeam:
     settings: CorrectionSettings
     photons: Photons | None
     light: NDArray[np.float64] | None
-    n_references: int
     done: dict[str, StepDone]
 
     @classmethod
@@ -74,7 +72,7 @@ class OpenBeam:
         """
         asked = selection.step(Preparation)
         alike = not (asked.by_current or scan.views_differ)
-        light, n = None if alike else light_scale(scan, asked.by_current), count_references(scan.source)
+        light = None if alike else light_scale(scan, asked.by_current)
         references = read_references(scan, read, selection, warn)
         if asked.flat_fields == "dynamic":
             references = with_dynamic_flats(scan, references, read, selection)
@@ -96,7 +94,7 @@ class OpenBeam:
             "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
             "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
         }
-        return cls(references, settings, photons, light, n, done)
+        return cls(references, settings, photons, light, done)
 
     def shadow(self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int) -> Shadow | None:
         """What stands in the beam of all views, judged from some of these; None if they are too few to tell.
@@ -128,11 +126,6 @@ def foreign_to_lines(source: ScanSource, views: NDArray[np.int64], read: slice, 
     lines = LinesPlan.of(np.inf).transmission(read_binned(source, some, read, binning), some.astype(np.float64), some)
     foreign = foreign_rows(np.exp(-lines.data), source.table.angles[some])
     return np.zeros(lines.data.shape[1:], np.bool_), foreign
-
-
-def count_references(source: ScanSource) -> int:
-    """Numbers of darks and flats in the file so far."""
-    return source.table.darks.size + source.table.flats.size
 
 
 _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side

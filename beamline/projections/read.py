@@ -149,8 +149,7 @@ class ViewFilters:
     def within(self, rows: slice | None) -> slice:
         """The same rows, binned, as a slice of what is read for all rows."""
         first, part = self.read(None).start, self.read(rows)
-        n = self.selection.binning
-        return slice((part.start - first) // n, (part.stop - first) // n)
+        return slice(*((edge - first) // self.selection.binning for edge in (part.start, part.stop)))
 
     def apply(self, views: Projections, rows: slice | None) -> Projections:
         """Apply all filters to the views, and return the requested rows."""

@@ -227,15 +227,10 @@ class CorrectionPlan:
         return np.where(self.masked, np.float32(1), level * self.dynamic.flat_of(view / level, self.settings.floor))
 
     def surveyed(self, views: Transmission) -> CorrectionPlan:
-        """The plan by which these views, too, were used in the search for air columns."""
+        """The plan by which these views, too, were used in the search for air columns; of all views, it has theirs."""
         if self.settings.air != "auto":
             return self
         return replace(self, profiles=(*self.profiles, (edge_profiles(views.data), views.view_ids)))
-
-    def settled(self) -> CorrectionPlan:
-        """The plan with the air columns of the views surveyed, whichever views follow."""
-        settings = replace(self.settings, air=self.air_columns if any(self.air_columns) else "none")
-        return replace(self, settings=settings, profiles=())
 
     def line_integrals(
         self,

@@ -296,7 +296,7 @@ def in_batches(
     for view in range(len(counts)):
         ids = np.array([view])
         plan = plan.surveyed(plan.transmission(counts[view : view + 1], at[view : view + 1], ids))
-    following: Plan = plan.settled()
+    following: Plan = replace(plan, settings=replace(options, air=plan.air_columns))  # whichever views follow
     parts = []
     for first, end in zip([0, *ends], [*ends, len(counts)], strict=True):
         batch = slice(first, end)
