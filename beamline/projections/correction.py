@@ -239,7 +239,7 @@ class ScanCorrection:
                 usable.append(some)
                 plan = plan.surveyed(plan.transmission(data, some.astype(np.float64), some))
             done(n)
-        return usable, replace(plan, settings=replace(plan.settings, air=plan.air_columns))
+        return usable, replace(plan, settings=replace(plan.settings, air=plan.air_columns), profiles=())
 
     def _next(
         self, data: NDArray[Any], frames: NDArray[np.int64], plan: Plan, last: bool

@@ -23,7 +23,6 @@ from beamline.projections.read import NoViewError, ViewFilters
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.scan_warnings import (
     report_defects,
-    warn_of_joined_views,
     warn_of_other_axis,
     warn_of_the_field,
     warn_of_units,
@@ -154,7 +153,6 @@ def require_usable(source: ScanSource, selection: Selection) -> None:
 def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
     """The usable views, their stated poses, and rows of wide views; refuses what is wrong before any frame is read."""
     source = scan.source
-    warn_of_joined_views(source, warn)
     usable = checked_views(scan, selection, warn)
     warn_of_units(source, selection, warn)
     first = choose_views(source, usable.frames, selection)

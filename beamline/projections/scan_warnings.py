@@ -16,7 +16,6 @@ from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order
 from beamline.projections.selection import ScanSelection
-from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import without_air
@@ -25,18 +24,6 @@ from recon.voxels.direct import has_direct_method
 from recon.voxels.field_edges import FieldEdges
 
 _SAME_AXIS = 0.05  # columns
-_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one view
-
-
-def warn_of_joined_views(source: ScanSource, warn: Warn) -> None:
-    degrees = float(source.attributes.get(JOINED_DEG, 0.0))
-    blur = np.radians(degrees) * source.shape[1] / 2
-    if blur > _JOINED_BLUR:
-        warn(
-            f"--frames-per-view {source.frames_per_view} averages frames that are up to {degrees:.3g} degrees apart, "
-            f"which blurs what lies at the edge of the field by {blur:.0f} pixels. Unless that is meant, give as many "
-            "as the scan took at each angle, or leave it out."
-        )
 
 
 def warn_of_units(source: ScanSource, selection: ScanSelection, warn: Warn) -> None:

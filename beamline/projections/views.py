@@ -152,7 +152,7 @@ def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> U
     if (poses := stated_poses(scan.source, selection)) is not None and poses.vectors is not None:
         findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
     refuse(scan.source, findings)
-    usable = usable_views(scan.source, asked.uses_flags, scan.asked.judged)
+    usable = usable_views(scan, asked.uses_flags)
     if usable.sentence:
         warn(Note(usable.sentence))
     for finding in findings:

@@ -21,6 +21,7 @@ from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -87,7 +88,7 @@ class FollowedViews:
 
     def usable(self) -> UsableViews:
         """The views in the file that may be used."""
-        return usable_views(self.source, self.selection.step(Preparation).uses_flags)
+        return usable_views(ScanEvidence(self.source), self.selection.step(Preparation).uses_flags)
 
     def chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """Which of these frames the selection uses, by their index among all views so far, which later views do not

@@ -40,16 +40,6 @@ class ReferenceGroups(NamedTuple):
     darks: tuple[I64, ...]
     flats: tuple[I64, ...]
 
-    @property
-    def complete(self) -> bool:
-        """Whether there are darks and flats."""
-        return bool(self.darks and self.flats)
-
-    def without(self, bad: list[int]) -> ReferenceGroups:
-        """These groups without some rows, and without groups that become empty."""
-        kept = ((np.setdiff1d(group, bad) for group in groups) for groups in self)
-        return ReferenceGroups(*(tuple(group for group in groups if group.size) for groups in kept))
-
 
 class Asked(NamedTuple):
     """What is asked of the evidence of a scan.
@@ -117,7 +107,9 @@ class ScanEvidence:
     @cached_property
     def good(self) -> ReferenceGroups:
         """The references without a fault; of a kind without a good one, all."""
-        return self.taken.without([row for each in self.findings if each.severity != "error" for row in each.frames])
+        bad = [row for each in self.findings if each.severity != "error" for row in each.frames]
+        kept = ((np.setdiff1d(group, bad) for group in groups) for groups in self.taken)
+        return ReferenceGroups(*(tuple(group for group in groups if group.size) for groups in kept))
 
     @property
     def used(self) -> ReferenceGroups:
@@ -254,7 +246,7 @@ class ScanEvidence:
     @cached_property
     def beam(self) -> tuple[F32, F32] | None:
         """Cells [cell row, cell col] of the mean dark and flat that are used; None where nothing is divided by them."""
-        if not (self.in_counts and self.used.complete):
+        if not (self.in_counts and all(self.used)):
             return None
         dark, flat = (self.mean_cells(np.concatenate(groups)) for groups in self.used)
         return dark, flat

@@ -130,7 +130,9 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
     if scan.beam is None:
         return
     dark, flat = np.min(scan.cells(np.concatenate(scan.used.darks)), axis=0), scan.beam[1]  # zingers light single darks
-    if not dark.any() and _change(scan) and not counts_photons(scan.source):
+    of_one = max(scan.used.flats, key=len)[:2] if not dark.any() else np.zeros(0, np.int64)
+    two = read_known(scan.source, of_one).astype(np.float64)  # alike where one image was written for them all
+    if len(two) > 1 and deviation_between_frames(two) and not counts_photons(scan.source):
         yield Finding(
             "warning",
             "light",
@@ -153,12 +155,6 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
         )
         sentence += "" if scan.asked.accepted else " --references accept uses these."
         yield Finding("warning" if scan.asked.accepted else "error", "light", sentence)
-
-
-def _change(scan: ScanEvidence) -> float:
-    """Noise of a pixel of the flats: 0 of an image that was written for them all, and where a group is a single one."""
-    two = read_known(scan.source, max(scan.used.flats, key=len)[:2]).astype(np.float64)
-    return deviation_between_frames(two) if len(two) > 1 else 0.0
 
 
 def _counts_in_words(scan: ScanEvidence) -> str:

@@ -14,6 +14,7 @@ from beamline.core.text import count, spans
 from beamline.plan.passes import ended_by
 from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
+from beamline.storage.readers.averaged import JOINED_DEG
 from beamline.storage.readers.base import ScanSource, TakesTooLongError
 from beamline.storage.rules import Finding, Severity
 from beamline.storage.rules.angles import angles_spread, angles_unknown
@@ -39,6 +40,7 @@ from beamline.storage.rules.treatment import frames_flagged
 from drivers.base.frame import FrameKind
 
 VARYING = "lengths"  # a rule on those that differ from view to view
+_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one view
 _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
 
 
@@ -135,6 +137,17 @@ def pixels_square(scan: ScanEvidence) -> Iterator[Finding]:
         )
 
 
+def joined_views(scan: ScanEvidence) -> str:
+    """Frames of one view that lie so far apart in angle that their mean is blurred."""
+    degrees = float(scan.source.attributes.get(JOINED_DEG, 0.0))
+    blur = np.radians(degrees) * scan.source.shape[1] / 2
+    return "" if blur <= _JOINED_BLUR else (
+        f"--frames-per-view {scan.source.frames_per_view} averages frames that are up to {degrees:.3g} degrees apart, "
+        f"which blurs what lies at the edge of the field by {blur:.0f} pixels. Unless that is meant, give as many "
+        "as the scan took at each angle, or leave it out."
+    )  # fmt: skip
+
+
 def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
     """The file is not a single part of a resumed scan."""
     if scan.table.part_starts.size > 1:
@@ -205,6 +218,7 @@ RULES: tuple[Rule, ...] = (
     pixels_square,
     stated_used,
     parts_joined,
+    Row("warning", "frames-per-view", joined_views),
     central_ray_taken,
     scan_ended,
     references_usable,

@@ -215,11 +215,12 @@ def _band(source: ScanSource, selection: ScanSelection, cols: int) -> ScanSelect
 def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
     """Bytes that `find_jumps` takes at most; 0 if the flags in the file name no jump, and none are made."""
     from beamline.projections.correction import at_once_memory
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.voxels.displacement import SWEEPS
     from recon.voxels.methods import OsSirtTv
 
     asked = selection.step(Preparation)
-    jumps = usable_views(source, asked.uses_flags).jumps
+    jumps = usable_views(ScanEvidence(source), asked.uses_flags).jumps
     if selection.cone is not None or not (asked.judged or jumps.size):
         return 0
     n = min(source.table.views.size, _VIEWS + 2 * _SHORT)

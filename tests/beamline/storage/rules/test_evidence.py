@@ -39,7 +39,7 @@ def test_rules_on_light_and_angles_read_each_frame_once_for_all_of_them() -> Non
     read = rows_read(source)
     assert read == sorted(set(read)) and set(range(8)) <= set(read)
     before = len(source.was_read)
-    assert evidence.used.complete and 0 < evidence.brightest <= 1.1 and evidence.unlit(8 + 20) is not None
+    assert all(evidence.used) and 0 < evidence.brightest <= 1.1 and evidence.unlit(8 + 20) is not None
     assert all(rows == [28] for rows, _ in source.was_read[before:])
 
 

@@ -59,7 +59,7 @@ def test_what_a_reconstruction_does_is_said_in_its_own_words(
     judged = FrameFlags.of_flags(flags)
     with open_scan(write_flagged(tmp_path / "s.h5", FRAMES, {})) as source:
         (finding,) = frames_flagged(ScanEvidence(source, Asked(judged=judged)))
-        taken = usable_views(source, True, judged)
+        taken = usable_views(ScanEvidence(source, Asked(judged=judged)), True)
     assert finding.message.endswith(f"A reconstruction (--flags use): {said}")
     assert taken.sentence.startswith(said)
     assert taken.frames.size == 18 - taken.left_out == (18 if region else 14)
