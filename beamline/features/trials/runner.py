@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from beamline.core.durations import seconds_left
+from beamline.core.durations import in_turn
 from beamline.core.errors import DataError
-from beamline.core.events import Done, Sink, TrialReached
+from beamline.core.events import Done, Sink
 from beamline.core.files import refuse_existing, refuse_not_utf8
 from beamline.core.machine import machine
 from beamline.core.recon_events import TrialDone, TrialsStarted
@@ -123,18 +123,16 @@ def _run_all(
     Raises:
         KeyboardInterrupt: before any trial was done; nothing was written.
     """
-    begin, todo = clock.now(), table.todo
+    trials, todo = [outcome.trial for outcome in table.outcomes], table.todo
     try:
-        for n, index in enumerate(todo):
-            trial, whole, spent = table.outcomes[index].trial, table, clock.now() - begin
-            eta, rate = seconds_left(n, len(todo), spent), 60 * n / max(spent, 1e-9)
-            sink(TrialReached(table.name, n, len(todo), trial.label, eta, rate, time=clock.now()))
+        for n, index in enumerate(in_turn(table.name, todo, lambda at: trials[at].label, sink, clock), 1):
+            trial, whole = trials[index], table
             table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
             outcome, _ = run(trial)
             table = whole.with_outcome(index, outcome)
             if table.compared:
                 write_table(folder, table)
-            sink(replace(_event_of(table, n + 1, len(todo), outcome), time=clock.now()))
+            sink(replace(_event_of(table, n, len(todo), outcome), time=clock.now()))
     except KeyboardInterrupt:
         if not table.compared:
             raise
