@@ -109,10 +109,27 @@ class TrialChoice(NamedTuple):
         return simplest_within_one_se(self.residuals, self.least_gain)
 
     @property
+    def best(self) -> int | None:
+        """Number of the candidate of least mean residual; None: none was tried."""
+        tried = [(float(left.mean()), at) for at, left in enumerate(self.residuals) if left is not None]
+        return min(((mean, at) for mean, at in tried if math.isfinite(mean)), default=(0.0, None))[1]
+
+    @property
     def least(self) -> F64 | None:
         """The residuals of the least mean; None: none was tried."""
-        tried = [each for each in self.residuals if each is not None and np.isfinite(each).all()]
-        return min(tried, key=lambda each: float(each.mean()), default=None)
+        return None if self.best is None else self.residuals[self.best]
+
+    @property
+    def verdicts(self) -> list[str]:
+        """[candidate] "best"; "alike", which predicts as well but for chance; or empty. All are empty where the best
+        lowers the residual of no other one by `least_gain`."""
+        least = self.least
+        if least is None or all(
+            left is None or (1 - self.least_gain) * left.mean() <= least.mean() for left in self.residuals
+        ):
+            return [""] * len(self.predictions)
+        alike = [left is not None and predicts_as_well(left, least) for left in self.residuals]
+        return ["best" if at == self.best else "alike" * same for at, same in enumerate(alike)]
 
     @property
     def prior(self) -> Prior | None:

@@ -41,7 +41,7 @@ def _options(tmp_path: Path, **changes: Any) -> ComparedScan:
 
 
 def run_tradeoff(scan: ComparedScan, sink: Callable[[Event], None] = lambda e: None) -> TrialTable:
-    return run_comparison(partial(planned_tradeoff, scan), scan, sink, SystemClock())
+    return run_comparison(partial(planned_tradeoff, scan), scan.source.path, scan.folder, sink, SystemClock())
 
 
 def _made_up(trial: MethodTrial, *_: object) -> tuple[Outcome, Any]:

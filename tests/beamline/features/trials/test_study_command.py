@@ -14,9 +14,9 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.features.trials import runner
-from beamline.features.trials.run_trial import TrialData, averaged, measured
+from beamline.features.trials.run_trial import TrialData, averaged
 from beamline.features.trials.trial import MethodTrial, Outcome
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.html_page import parsed_page
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -30,10 +30,10 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> list[tuple[MethodTrial, TrialData]]
     """Rows are off the truth by ERROR everywhere; the FBP of all views is the truth."""
     found: list[tuple[MethodTrial, TrialData]] = []
 
-    def trial(trial: MethodTrial, data: TrialData, seed: int) -> tuple[Outcome, NDArray[np.float32]]:
+    def trial(trial: MethodTrial, data: TrialData) -> tuple[Outcome, NDArray[np.float32]]:
         grid = Grid.matching(data.geometry)
         volume = SCAN.truth(grid) + np.float32(ERROR if found else 0)
-        figures, _ = measured(trial.method, volume, data, grid)
+        figures, _ = data.measured(trial, Volume(volume, grid))
         assert trial.choice is not None
         found.append((trial, replace(data, prepared=averaged(data.prepared, trial.choice))))
         return Outcome(trial, "done", 2.0, 10**8, figures, cpu_seconds=1.0), volume
