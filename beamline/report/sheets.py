@@ -75,8 +75,8 @@ class SliceSheet:
             images = [image[_differ_most(images)] for image in images]
             window = matter_window(*images)
         rows, cols = np.max([image.shape for image in images], axis=0).tolist()
-        line, gap, down = 0.06 * cols, round(0.04 * cols), -(-len(labels) // self._across)
-        head = round((3 if marks else 2) * line)
+        gap, down, lines = round(0.04 * cols), -(-len(labels) // self._across), 3 if marks else 2
+        head = round(0.06 * lines * cols)
         # One image: a panel for each slice takes ten times as long to draw.
         sheet = np.full((down * (rows + head), self._across * (cols + gap)), np.nan, np.float32)
         size = (WIDTH, WIDTH * sheet.shape[0] / sheet.shape[1])
@@ -89,7 +89,9 @@ class SliceSheet:
             sheet[top : top + rows, left : left + cols] = image[np.ix_(*nearest)]
             below, colour = (marks or {}).get(label, ("", ""))
             words = "\n".join(filter(None, (label.rpartition(": ")[0] or label, below)))
-            axes.text(left + cols / 2, top - 0.8 * line, words, fontsize=7, ha="center", color=colour or "black")
+            axes.text(
+                left + cols / 2, top - 0.8 * head / lines, words, fontsize=7, ha="center", color=colour or "black"
+            )
             if colour:
                 axes.add_patch(Rectangle((left - 0.5, top - 0.5), cols, rows, fill=False, ec=colour, lw=2.5))
         axes.text(0.02 * cols, head + 0.95 * rows, f"x → {self._down} ↓", fontsize=6, color="tab:orange")

@@ -25,7 +25,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Method, RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
-from recon.judgement import judge
+from recon.judgement import contrast_in, judge
 from recon.warm_up import warm_up
 
 _JUDGED = "psnr", "ssim3d", "residual_held_out"
@@ -73,7 +73,7 @@ class TrialData(TrialScan):
             monitor says of views: trials are compared by all rays with the same weight.
         truth: the volume [z, y, x] on Grid.matching(geometry).
         references: volumes on the same grid that trials are compared with, in addition to the truth, by method.
-        regions: int8 [z, y, x], mask of dense and empty regions, see `metrics.kmeans_mask`; None without contrast.
+        regions: int8 [z, y, x], dense and empty regions, see `recon.judgement.regions_of`; None: there are none.
         seed: of all trials.
     """
 
@@ -106,7 +106,7 @@ class TrialData(TrialScan):
             figures["psnr_all"] = metrics.psnr(reference, made.data)
             figures["ssim_all"] = metrics.ssim3d(reference, made.data)
         if self.regions is not None:
-            figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(made.data), self.regions)
+            figures |= contrast_in(self.regions, made)
         return figures, [] if judged.held_out is None else judged.held_out.left.tolist()
 
 

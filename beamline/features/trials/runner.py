@@ -27,10 +27,10 @@ from beamline.reconstruct.truth import fit_truth, read_truth
 from beamline.report.sheets import SliceSheet
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import Clock
-from recon.assess import metrics
 from recon.base.arrays import F32
 from recon.base.empirical import ONE_IN
-from recon.base.volume import Grid
+from recon.base.volume import Grid, Volume
+from recon.judgement import regions_of
 
 _HELD_OUT_VIEWS = 16  # at most
 
@@ -220,13 +220,12 @@ def with_references(data: TrialData, references: Sequence[MethodTrial], run: Run
     Raises:
         DataError: a reference could not be made.
     """
-    volumes, regions = dict[str, F32](), None
+    volumes = dict[str, F32]()
     for reference in references:
         outcome, volume = run(data, reference)
         if volume is None:
             raise DataError(f"{reference.label}, to compare with, failed: {outcome.message}. Nothing was written.")
         volumes[reference.method] = volume
     contrast = next(iter(volumes.values())) if data.truth is None else data.truth
-    with suppress(ValueError):  # it has no dense and empty regions
-        regions = metrics.kmeans_mask(metrics.sampled(contrast), data.seed)
+    regions = regions_of(Volume(contrast, Grid.matching(data.geometry)), data.seed)
     return replace(data, references=volumes, regions=regions)

@@ -18,17 +18,6 @@ from beamline.report.html import Picture, render
 from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
 
-FIGURES = {
-    "psnr": ("PSNR", "dB against the truth"),
-    "ssim3d": ("SSIM", "mean over the slices of three directions, against the truth"),
-    "psnr_all": ("PSNR all", "dB against the volume of all views by the same method"),
-    "ssim_all": ("SSIM all", "against the same volume"),
-    "snr": ("SNR rims", "dB, of the whole dense and empty region, with their rims"),
-    "cnr": ("CNR rims", "dB, of the same regions"),
-    HELD_OUT: ("held out", METRICS[HELD_OUT].label),
-}
-"""Heading of each metric of a trial, and what it is."""
-_DIGITS_OF = {"psnr_all": "psnr", "ssim_all": "ssim3d"}
 _MARKS = {"front": "*", "best": "*", "alike": "~"}
 _LEGENDS = {
     "front": "*: on the front of time and quality.",
@@ -41,25 +30,29 @@ _WIDTH = 120  # characters
 
 def columns(table: TrialTable) -> list[str]:
     """Headings of the table."""
-    return ["s", "CPU s", "MB", *(words for name, (words, _) in FIGURES.items() if name in table.metrics)]
+    return ["s", "CPU s", "MB", *(METRICS[name].short for name in figures_of(table))]
+
+
+def figures_of(table: TrialTable) -> list[str]:
+    """Names of the figures that any row has, in their usual order."""
+    return [name for name in METRICS if name in table.metrics]
 
 
 def cells(table: TrialTable, outcome: Outcome) -> list[str]:
     """The values of a row under `columns`, as text."""
     memory = "–" if outcome.peak_bytes is None else f"{outcome.peak_bytes / 1e6:.0f}"
-    shown = [name for name in FIGURES if name in table.metrics]
     figures = [
-        _figure(name, outcome.metrics[name], 2 * table.asks_best) if name in outcome.metrics else "–" for name in shown
+        _figure(name, outcome.metrics[name], 2 * table.asks_best) if name in outcome.metrics else "–"
+        for name in figures_of(table)
     ]
     return [_seconds(outcome.seconds), _seconds(outcome.cpu_seconds), memory, *figures]
 
 
 def _figure(name: str, value: float, finer: int = 0) -> str:
     """A figure with its digits, and so many more; "equal" for the PSNR of two equal volumes."""
-    name = _DIGITS_OF.get(name, name)
     if math.isfinite(value):
         return f"{value:.{METRICS[name].digits + finer}f}"
-    return "equal" if name == "psnr" and value > 0 else "undefined"
+    return "equal" if name.startswith("psnr") and value > 0 else "undefined"
 
 
 def _seconds(seconds: float) -> str:
@@ -89,7 +82,8 @@ def text(table: TrialTable) -> str:
             lines.append(row(_MARKS.get(verdict, " "), outcome.trial.label, cells(table, outcome)))
         else:
             lines.append(f"  {outcome.trial.label}  {_status(outcome)}")
-    legends = [f"{words}: {legend}" for name, (words, legend) in FIGURES.items() if name in table.metrics]
+    shown = [METRICS[name] for name in figures_of(table)]
+    legends = [f"{each.short}: {each.label}{', dB' if each.unit else ''}" for each in shown]
     notes = ["; ".join(legends) + "."] if legends else []
     notes += [legend for verdict, legend in _LEGENDS.items() if verdict in verdicts]
     notes += [*sentences(table), *(f"{o.trial.label}: {o.message}." for o in table.compared if o.message)]
@@ -166,8 +160,8 @@ def _draws(table: TrialTable) -> Iterator[str]:
             families.setdefault((outcome.trial.method, outcome.trial.choice.family), []).append(outcome)
     for (method, family), rows in families.items():
         parts = []
-        for name in [name for name in FIGURES if name in table.metrics]:
+        for name in figures_of(table):
             values = [row.metrics[name] for row in rows if name in row.metrics]
             mean, low, high = (_figure(name, float(of(values))) for of in (np.mean, min, max))
-            parts.append(f"{FIGURES[name][0]} {mean} ({low} to {high})")
+            parts.append(f"{METRICS[name].short} {mean} ({low} to {high})")
         yield f"{method}, {family}, mean of {len(rows)}: {', '.join(parts)}."

@@ -82,7 +82,7 @@ def _note(n_views: int) -> str:
     return (
         f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and settings: "
         "they say what fewer views lose, not which method is better. That volume has noise, too, which rows share as "
-        "far as they share its views. SNR and CNR are not those of beamline recon; a smoother volume has more."
+        "far as they share its views. A smoother volume has more SNR and CNR."
     )
 
 
