@@ -139,6 +139,7 @@ def run_trial(
     """Make a trial's reconstruction and measure it: the outcome, and the volume [z, y, x]; None where it failed."""
     try:
         method, prepared, grid, seed, device = data.asked_by(trial)
+        trial = replace(trial, views=prepared.geometry.n_views)
         warm_up(method, prepared.geometry, device=device)  # so that compilation is in no trial's time
         reset_peak_memory()
         before = cpu()
