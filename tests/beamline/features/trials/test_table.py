@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from beamline.core.files import write_table
 from beamline.core.machine import machine
-from beamline.features.trials import pictures as module
+from beamline.features.trials import table as module
 from beamline.features.trials.table import sentences, to_html
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time
 from beamline.features.trials.trial import LEAST_GAIN, MethodTrial, Outcome, TrialTable
