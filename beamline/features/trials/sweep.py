@@ -285,7 +285,7 @@ def planned_sweep(trials: Trials, command: str, sink: Sink, clock: Clock) -> Pla
     across = len({values[[*first][1]] for values, _ in trials}) if len(first) > 1 else min(COLUMNS, len(trials))
     table = TrialTable(
         "sweep", f"{' and '.join(first)} of a slice", tuple(Outcome(each, "not run") for each in swept), HELD_OUT,
-        machine(), facts, command, f"Which {' and '.join(first)} predicts views held out?", asks_best=True,
+        machine(), facts, command, f"Which {' and '.join(first)} predicts views held out best?", asks_best=True,
     )  # fmt: skip
     scan = SweptScan(swept, sink, clock)
     return Planned(lambda run: scan, table, SliceSheet(across=across, closer=True))
