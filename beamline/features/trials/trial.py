@@ -238,7 +238,7 @@ class TrialTable:
             "seconds_asked": trial.seconds_asked,
             **{name: getattr(outcome, name) for name in ("seconds", "cpu_seconds", "peak_bytes")},
             "gaussians_end": outcome.gaussians,
-            **{name: outcome.metrics.get(name) for name in sorted(self.metrics)},
+            **{name: outcome.metrics.get(name) for name in sorted(self.metrics | {self.by})},
             "quality_db": outcome.quality(self.by),
             "verdict": self.verdict(outcome),
             "message": outcome.message,

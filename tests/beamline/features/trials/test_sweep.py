@@ -113,6 +113,13 @@ def test_an_interrupt_keeps_the_slices_that_are_done(
     assert [row["status"] for row in _table()] == ["done", "done", "interrupted"]
 
 
+def test_values_that_change_pixels_have_no_score(folder: Path) -> None:
+    result = beamline("sweep", "scan.h5", "bin=1,2", "--axis", "20.7")
+    assert result.exit_code == 0 and "No score: the values change pixels" in result.stdout
+    assert [(row["status"], row["residual_held_out"], row["verdict"]) for row in _table()] == [("done", "", "")] * 2
+    assert Path("scan_sweep/slices.png").read_bytes().startswith(PNG)
+
+
 def _unseen(model: float, value: float, ids: tuple[int, int] = (1, 5), views: str = "") -> UnseenViews:
     """A volume that shows so much in views held out of this value."""
     geometry = Geometry.parallel(np.array([0.0, 1.0]), (1, 4), axis_col=1.5, pixel_pitch=1.0)
