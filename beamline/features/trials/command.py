@@ -106,21 +106,21 @@ def tradeoff(request: TradeoffRequest) -> None:
     from beamline.features.trials.runner import compare
     from beamline.features.trials.tradeoff import planned_tradeoff
 
-    scan = _compared(request, request.methods or (), f"{safe_name(request.file.stem)}_tradeoff")
+    scan = _compared(request, request.methods or ())
+    folder = request.output or Path(f"{safe_name(request.file.stem)}_tradeoff")
     plan = partial(planned_tradeoff, scan, depth="quick" if request.quick else "full")
-    compare(plan, request.file, scan.folder, as_json=request.as_json)
+    compare(plan, request.file, folder, as_json=request.as_json)
 
 
-def _compared(request: TradeoffRequest | StudyRequest, methods: tuple[str, ...], folder: str) -> ComparedScan:
-    """The scan of a command, after its options were checked; `folder` is the usual one of its result."""
+def _compared(request: TradeoffRequest | StudyRequest, methods: tuple[str, ...]) -> ComparedScan:
+    """The scan of a command, after its options were checked."""
     from beamline.features.trials.runner import ComparedScan
 
     context, values = click.get_current_context(), request.values
     refuse_contradictions(context.command, names_given(context))
     source, selection = chosen(request.file, request.seed, values)
-    output = request.output or Path(folder)
     return ComparedScan(
-        source, selection, output, methods, request.truth,
+        source, selection, methods, request.truth,
         request.seconds, request.seed,
         typed_line(context),
     )  # fmt: skip
@@ -192,7 +192,8 @@ def study(request: StudyRequest) -> None:
 
     methods, command = tuple(dict.fromkeys(request.methods)), click.get_current_context().command
     settings = row_settings(command, methods, dict(request.values))
-    scan = _compared(request, methods, f"{safe_name(request.file.stem)}_{request.which}")
+    scan = _compared(request, methods)
+    folder = request.output or Path(f"{safe_name(request.file.stem)}_{request.which}")
     asked = STUDIES[request.which]
     plan = partial(planned_study, scan, asked, settings=settings, ramp=request.ramp, draws=request.draws)
-    compare(plan, request.file, scan.folder, as_json=request.as_json)
+    compare(plan, request.file, folder, as_json=request.as_json)

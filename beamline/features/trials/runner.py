@@ -40,7 +40,6 @@ class ComparedScan:
     """The scan of a trade-off or a study, and what holds for all of its reconstructions.
 
     Attributes:
-        folder: for the results; must not exist.
         methods: names in `recon.methods`; none: those that suit the comparison.
         truth: FILE or FILE:first:end to compare with.
         seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
@@ -49,7 +48,6 @@ class ComparedScan:
 
     source: SourceOptions
     selection: Selection
-    folder: Path
     methods: Sequence[str] = ()
     truth: str | None = None
     seconds: float | None = None
@@ -92,8 +90,6 @@ def opened_scan(
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    refuse_not_utf8(asked.source.path)
-    refuse_existing(asked.folder)
     truth_given = None if asked.truth is None else read_truth(asked.truth)
     with asked.source.open() as source:
         facts = dict(facts_of(source).table)
@@ -186,11 +182,14 @@ def run_comparison(plan: Plan, file: Path | str, folder: Path, sink: Sink, clock
     Args:
         plan: reads the scan and says which trials to run.
         file: of the scan, for the event.
+        folder: must not exist.
 
     Raises:
         ConfigError, DataError: nothing was written, or the table of the trials that were done.
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
+    refuse_not_utf8(file)
+    refuse_existing(folder)
     began = clock.now()
     planned = plan(sink, clock)
     table, path, run = planned.table, folder / f"{planned.table.name}.csv", partial(_run_and_show, planned.slices)

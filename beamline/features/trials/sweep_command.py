@@ -18,7 +18,6 @@ import click
 from beamline.cli.options import Declared, json_option, name_of, new_folder_option
 from beamline.cli.recipe import names_given
 from beamline.cli.recon import options_of, recon
-from beamline.core.files import refuse_existing, refuse_not_utf8
 from beamline.core.text import NUMBER, safe_name
 from recon.base.registry import did_you_mean
 from recon.methods import BASELINE
@@ -143,8 +142,6 @@ def sweep(words: tuple[str, ...], output: Path | None, as_json: bool) -> None:
     trials = _trials(options, common)
     file = trials[0][1].source.path
     folder = output or Path(f"{safe_name(Path(file).stem)}_sweep")
-    refuse_not_utf8(file)
-    refuse_existing(folder)
     plan = partial(planned_sweep, trials, shlex.join(["beamline", "sweep", *words]))
     table = compare(plan, file, folder, as_json=as_json)
     if not as_json and table.best is not None:

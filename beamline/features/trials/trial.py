@@ -222,31 +222,28 @@ class TrialTable:
 
     @property
     def records(self) -> list[dict[str, Any]]:
-        """The rows of the CSV."""
-        return [self.record(outcome) for outcome in self.outcomes]
-
-    def record(self, outcome: Outcome) -> dict[str, Any]:
-        """A row of the CSV: all that is known of a trial, by name; None where it is known of another row only."""
-        trial = outcome.trial
-        every = [each.trial for each in self.outcomes]
-        values: dict[str, Any] = {
-            "row": trial.label if trial.choice is None else trial.choice.label,
-            **{name: getattr(trial, name) for name in ("group", "method", "views", "frames")},
-            "window": 1 if trial.choice is None else trial.choice.window,
-            **{name: trial.settings.get(name) for each in every for name in each.settings},
-            "status": outcome.status,
-            "seconds_asked": trial.seconds_asked,
-            **{name: getattr(outcome, name) for name in ("seconds", "cpu_seconds", "peak_bytes")},
-            "gaussians_end": outcome.gaussians,
-            **{name: outcome.metrics.get(name) for name in sorted(self.metrics | {self.by})},
-            "quality_db": outcome.quality(self.by),
-            "verdict": self.verdict(outcome),
-            "message": outcome.message,
-        }
-        return {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in values.items()
-        }
+        """The rows of the CSV: all that is known of each trial, by name; None where it is known of another row only."""
+        settings = [name for outcome in self.outcomes for name in outcome.trial.settings]
+        rows: list[dict[str, Any]] = []
+        for outcome in self.outcomes:
+            trial = outcome.trial
+            values: dict[str, Any] = {
+                "row": trial.label if trial.choice is None else trial.choice.label,
+                **{name: getattr(trial, name) for name in ("group", "method", "views", "frames")},
+                "window": 1 if trial.choice is None else trial.choice.window,
+                **{name: trial.settings.get(name) for name in settings},
+                "status": outcome.status,
+                "seconds_asked": trial.seconds_asked,
+                **{name: getattr(outcome, name) for name in ("seconds", "cpu_seconds", "peak_bytes")},
+                "gaussians_end": outcome.gaussians,
+                **{name: outcome.metrics.get(name) for name in sorted(self.metrics | {self.by})},
+                "quality_db": outcome.quality(self.by),
+                "verdict": self.verdict(outcome),
+                "message": outcome.message,
+            }
+            unknown = [name for name, each in values.items() if isinstance(each, float) and not math.isfinite(each)]
+            rows.append(values | dict.fromkeys(unknown))
+        return rows
 
 
 def _rounded(cost: float) -> float:
