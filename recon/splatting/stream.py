@@ -412,7 +412,7 @@ class StreamingFit:
             radius = geometry.reach if wider is None else math.inf
             placed = sample_gaussians(volume, count, self._rng, field_radius=radius, kernel=kernel)
             placed = scale_to_data(placed, seen, geometry)
-        self._problem = fit.problem_of(data, every, field, placed.density_unit, self._settings)
+        self._problem = fit.problem_of(Views(data, every), field, placed.density_unit, self._settings)
         self._state, self._schedule_step = fit.init(placed, self._rng), 0
         self._placed = placed.n
         self._data, self._unseen = [], []  # the problem holds them from now on
