@@ -7,7 +7,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ class TrialRun(NamedTuple):
     device: str = "cpu"
 
 
-class TrialScan:
+class TrialScan(Protocol):
     """The scan of some trials: what each runs, and what its volume is worth.
 
     Attributes:
@@ -53,11 +53,9 @@ class TrialScan:
 
     def asked_by(self, trial: MethodTrial) -> TrialRun:
         """What a trial runs. Raises ValueError for a setting, or views, that there are not."""
-        raise NotImplementedError
 
     def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
         """Figures of a volume by name, and the squared residual of each view held out."""
-        raise NotImplementedError
 
     def concluded(self, table: TrialTable) -> TrialTable:
         """The table with what follows from all of its trials."""

@@ -260,7 +260,7 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
 
 def shares_of(choice: TrialChoice) -> list[float]:
     """[candidate] the residual of all views held out, as in `recon.judgement`."""
-    return [float(np.sqrt(np.square(left).mean())) for left in choice.residuals if left is not None]
+    return [float(np.sqrt(np.square(left).mean())) for left in choice.tried.values()]
 
 
 Trials = Sequence[tuple[Mapping[str, str], ReconOptions]]
