@@ -62,7 +62,7 @@ def made(wide: tuple[np.ndarray, np.ndarray]) -> recon.Reconstruction:
 @pytest.fixture(scope="module")
 def found(wide: tuple[np.ndarray, np.ndarray]) -> SampleRadius | None:
     """How far that can reaches, by its views."""
-    return sample_radius(wide[0], GEOMETRY)
+    return sample_radius(Views(wide[0], GEOMETRY))
 
 
 def test_a_sample_within_the_field_gets_the_volume_of_the_method_to_the_bit() -> None:
@@ -74,7 +74,7 @@ def test_a_sample_within_the_field_gets_the_volume_of_the_method_to_the_bit() ->
 
 
 def test_a_can_as_wide_as_the_field_is_not_taken_for_a_wider_one() -> None:
-    assert sample_radius(views_of(can(COLS / 2)), GEOMETRY) is None
+    assert sample_radius(Views(views_of(can(COLS / 2)), GEOMETRY)) is None
 
 
 def test_the_radius_is_that_of_the_can(found: SampleRadius | None) -> None:
@@ -107,9 +107,9 @@ def test_volume_and_outside_together_explain_the_views(
 def test_a_given_radius_is_taken(wide: tuple[np.ndarray, np.ndarray]) -> None:
     made = recon.reconstruct(wide[0], GEOMETRY, METHOD, use=DataUse(sample_radius=55.0))
     assert made.settings["sample_radius"] == made.settings["sample_radius_high"] == 55.0
-    assert sample_radius(wide[0], GEOMETRY, given=20.0) is None  # within the field
+    assert sample_radius(Views(wide[0], GEOMETRY), given=20.0) is None  # within the field
     known = SampleRadius(50.0, 48.0, 53.0, 0.02)
-    assert sample_radius(wide[0], GEOMETRY, given=known) is known
+    assert sample_radius(Views(wide[0], GEOMETRY), given=known) is known
 
 
 def test_a_small_grid_holds_what_the_field_holds_there(
@@ -122,7 +122,7 @@ def test_a_small_grid_holds_what_the_field_holds_there(
 
 def test_few_views_take_the_end_that_fbp_takes_and_say_that_nothing_is_known() -> None:
     some = GEOMETRY.select(np.arange(0, VIEWS, 4))
-    found = sample_radius(views_of(can(1.6 * COLS / 2), some), some)
+    found = sample_radius(Views(views_of(can(1.6 * COLS / 2), some), some))
     assert found is not None and (found.low, found.high, found.density) == (COLS / 2, 4.5 * COLS / 2, 1.0)
     assert found.radius == pytest.approx(1.6 * COLS / 2, rel=0.15)
 
@@ -158,7 +158,7 @@ def test_wide_views_make_the_density_surer_and_have_no_part_in_fbp(
     )
     assert both.reach == GEOMETRY.reach and both.ordinary.sum() == VIEWS
     views = np.concatenate((wide[0], views_of(can(1.6 * COLS / 2), both.select(np.arange(VIEWS, VIEWS + 4)))))
-    seen = sample_radius(views, both)
+    seen = sample_radius(Views(views, both))
     assert found is not None and seen is not None and seen.density < 0.8 * found.density
     assert 0.88 < seen.radius / (1.6 * COLS / 2) < 1.05
     fbp = [recon.reconstruct(data, each, "fbp").volume.data for data, each in ((views, both), (wide[0], GEOMETRY))]
