@@ -276,8 +276,8 @@ def test_gpu_curve() -> None:
 
 def test_open_pages(monkeypatch: Patch, tmp_path: Path) -> None:
     bench = script("test_open_pages")
-    small(monkeypatch, bench, PAIRS=1, PAGES=1, VIEWS=24)
-    measured(bench.test_open_pages_cost_a_scan_nothing, tmp_path, 20.0)
+    small(monkeypatch, bench, PAIRS=1, PAGES=1, VIEWS=24, SPAN=60)
+    measured(bench.test_open_pages_cost_a_scan_nothing, tmp_path, 10.0)
 
 
 def recon_of(scan: Path, angles: Path, output: Path) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import psutil
 import pytest
 
-PAGES, VIEWS, PAIRS = 20, 240, 3
+PAGES, VIEWS, SPAN, PAIRS = 20, 240, 180, 3
 
 
 def _page(host: str, token: str) -> None:
@@ -45,7 +45,7 @@ def _scan(runs: Path, per_s: float, pages: int) -> tuple[float, float]:
     command = [
         sys.executable, "-m", "beamline.cli.main", "scan", "configs/simulated.yaml", "--page", "--no-live", "-o",
         str(runs), "--set", f"scan.period_s={1 / per_s}", "--set", "scan.exposure_s=0.02", "--set",
-        f"scan.angles={{scheme: fixed, views: {VIEWS}, start_deg: 20, span_deg: 180}}",
+        f"scan.angles={{scheme: fixed, views: {VIEWS}, start_deg: 20, span_deg: {SPAN}}}",
     ]  # fmt: skip
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as scan:
         assert scan.stderr is not None
