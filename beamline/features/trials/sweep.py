@@ -21,7 +21,7 @@ from beamline.features.trials.runner import Planned
 from beamline.features.trials.trial import HELD_OUT, MethodTrial, Outcome, TrialTable
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import PreparedProjections, hold_out
-from beamline.projections.selection import Selection, cone_of, rows_of
+from beamline.projections.selection import Selection
 from beamline.reconstruct.job import compile_kernels
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.scan_facts import facts_of
@@ -106,9 +106,10 @@ def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
 def _middle(trial: ReconOptions, halo: int) -> Selection:
     selection = trial.selection
     with trial.source.open() as source:
-        rows, n = rows_of(source, selection), selection.binning
-        if selection.rows is not None or cone_of(source, selection) is not None:
-            return selection
+        part, n = selection.of(source), selection.binning
+    if selection.rows is not None or part.cone is not None:
+        return selection
+    rows = part.detector_rows
     height = min(2 * halo + 1, (rows.stop - rows.start) // n) * n
     first = rows.start + (rows.stop - rows.start - height) // 2
     return replace(selection, rows=(first, first + height), axis_rows=selection.axis_rows or (rows.start, rows.stop))
