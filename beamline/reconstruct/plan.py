@@ -245,8 +245,8 @@ def prepare_within(
     if options.method.traits.in_time:
         prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
     if knows_outside(options.method.traits):
-        views = prepared.projections.data, prepared.geometry, prepared.ray_factors(), prepared.sample_radius
-        prepared = replace(prepared, sample_radius=sample_radius(*views) or 0.0)  # it is not searched again
+        radius = sample_radius(prepared.views, prepared.sample_radius) or 0.0  # it is not searched again
+        prepared = replace(prepared, sample_radius=radius)
     return prepared, of_views(source, options, plan, prepared)
 
 
