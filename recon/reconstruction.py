@@ -93,10 +93,8 @@ def reconstruct(
     grid = grid or Grid.matching(geometry)
     problem = ReconProblem(Views(data, geometry, use.weights), grid, use, int(seed), device)
     result = run_on_extended_grid(chosen, problem, control)
-    return replace(
-        result, settings=dict(result.settings), method=result.method or chosen.name,
-        seconds=result.seconds or control.now() - begin,
-    )  # fmt: skip
+    by, seconds = result.method or chosen.name, result.seconds or control.now() - begin
+    return replace(result, settings=dict(result.settings), method=by, seconds=seconds)
 
 
 def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | RayWeights | None) -> None:
