@@ -77,7 +77,7 @@ def reconstruct(
     chosen = by_name(method)() if isinstance(method, str) else method
     use, control = use or DataUse(), control or RunControl()
     _refuse_foreign(chosen, device, use, control)
-    _refuse_one_side(geometry)
+    _refuse_geometry(geometry)
     if isinstance(projections, Counts):
         projections, use = _of_counts(projections, geometry, use)
         data = _line_integrals(projections, geometry)
@@ -87,19 +87,14 @@ def reconstruct(
         _warn_of_unknown(data, use.weights)
     if not setting(chosen, "allow_negative", False):  # a method with that setting may be asked for such voxels
         _warn_of_negative(data)
-    if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
-        raise ValueError(sentence)
     warn_of_degrees(geometry.angles)
-    grid = grid or Grid.matching(geometry)
     _warn_of_unseen_cone(chosen, geometry)
     begin = control.now()
-    views = Views(data, geometry, use.weights)
-    problem = ReconProblem(views, grid, use, int(seed), device)
+    grid = grid or Grid.matching(geometry)
+    problem = ReconProblem(Views(data, geometry, use.weights), grid, use, int(seed), device)
     result = run_on_extended_grid(chosen, problem, control)
-    return replace(
-        result, settings=dict(result.settings), method=result.method or chosen.name,
-        seconds=result.seconds or control.now() - begin,
-    )  # fmt: skip
+    by, seconds = result.method or chosen.name, result.seconds or control.now() - begin
+    return replace(result, settings=dict(result.settings), method=by, seconds=seconds)
 
 
 def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | RayWeights | None) -> None:
@@ -146,7 +141,8 @@ def _chooses_prior(method: Method) -> bool:
     return bool(getattr(method, "trial_sweeps", 0) or getattr(method, "finish_sweeps", 0))
 
 
-def _refuse_one_side(geometry: Geometry) -> None:
+def _refuse_geometry(geometry: Geometry) -> None:
+    """Raise ValueError for views from one side only, and for an axis outside the detector."""
     # Parallel views half a turn apart hold the same rays, so |sin| of the angle between two tells whether they differ.
     # A cone's, and those that look down on the rotation axis, differ up to the whole turn.
     turn = (geometry.angles - geometry.angles[0]) / (2 if geometry.is_cone or geometry.tilt.any() else 1)
@@ -155,6 +151,8 @@ def _refuse_one_side(geometry: Geometry) -> None:
             f"{geometry.n_views} views from one side ({np.rad2deg(geometry.angles[0]):g} degrees): one view does not "
             "determine a volume; give at least two, at different angles"
         )
+    if sentence := unseen_axis(geometry.axis_col + geometry.offsets[:, 0], geometry.detector_shape[1]):
+        raise ValueError(sentence)
 
 
 def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunControl) -> None:

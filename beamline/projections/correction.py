@@ -41,7 +41,7 @@ NO_VIEWS = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
-class ScanPlan:
+class ScanCorrectionPlan:
     """What converts the frames of one scan to line integrals, in the rows and with the binning of a selection.
 
     Attributes:
@@ -77,7 +77,7 @@ class ScanPlan:
             references, beam.settings, standing=standing, photons=photons, foreign=foreign, light=light
         )  # fmt: skip
 
-    def in_shadow(self, source: ScanSource, views: NDArray[np.int64]) -> ScanPlan:
+    def in_shadow(self, source: ScanSource, views: NDArray[np.int64]) -> ScanCorrectionPlan:
         """The plan with what stands in the beam of all views of a finished scan, as some of these show it."""
         read, n = self.filters.read(None), self.filters.selection.binning
         if not source.finished:
@@ -88,7 +88,9 @@ class ScanPlan:
             return replace(self, shadow=self.beam.shadow(source, views, read.start, n))
 
 
-def survey(scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS) -> ScanPlan:
+def survey(
+    scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDArray[np.int64] = NO_VIEWS
+) -> ScanCorrectionPlan:
     """Read the reference frames that the scan has, and of a finished scan some views.
 
     Groups of references with a fault are used only where no other is left.
@@ -114,7 +116,7 @@ def survey(scan: ScanEvidence, selection: ScanSelection, warn: Warn, views: NDAr
         raise ConfigError(f"--noise counts: {source.path} contains line integrals, not counts. Leave it out.")
     elif asked.by_current:
         current_scale(scan)  # refuses a file without any
-    plan = ScanPlan(filters, beam, asked)
+    plan = ScanCorrectionPlan(filters, beam, asked)
     return plan.in_shadow(source, views) if views.size else plan
 
 

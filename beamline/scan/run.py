@@ -33,7 +33,7 @@ from beamline.scan.resume import ResumableRun
 from beamline.scan.runs import record_sink
 from beamline.scan.watchdog import watched
 from beamline.storage.run_record import RecordFile, RunRecord
-from drivers.base.clock import SystemClock
+from drivers.base.clock import Clock, SystemClock
 from drivers.in_beam import Ask
 from drivers.stages.shared import FOUND
 
@@ -87,15 +87,9 @@ def run_scan(
         _refuse_stop(stop)
         folder = series.begin(ready) if series else create_run_folder(place, _named(config), SystemClock().now())
         with ExitStack() as stack:
-            record, *logs = _logs(config, ready, folder, stack)
+            sink = _announcing(config, ready, folder, instrument.clock, sinks, stack)
             if series is not None:
                 series.lock.release()  # that of the part keeps others away from here on
-            # The record in a thread of its own: a terminal that takes no event does not hold it up.
-            announcers = [Announcer(each, instrument.clock) for each in ([record], [*logs, *sinks])]
-            sink = fan_out(*map(stack.enter_context, announcers))
-            for device, description in ready.info.devices.items():
-                if settings := description.get(FOUND):
-                    sink(Warned(f"{device}: before it was opened: {settings}."))
             measurement = Measurement(config, instrument, ready, folder, stop, sink, began, series)
             pause = measurement.pause
             stack.enter_context(verbs_taken(folder, stop, pause, measurement.decider.answer))
@@ -105,6 +99,21 @@ def run_scan(
                 guarded.enter_context(watched(folder, sink, stop, without))
             guarded.callback(connected.close)
             return _to_its_end(measurement, live, afterwards, guarded.close)
+
+
+def _announcing(
+    config: Config, ready: ReadyScan, folder: Path, clock: Clock, sinks: Sequence[Sink], stack: ExitStack
+) -> Sink:
+    """One sink for the run's record, its logs and `sinks`, each reached by a thread until the stack closes; it begins
+    with the settings that the devices had before they were opened."""
+    record, *logs = _logs(config, ready, folder, stack)
+    # The record in a thread of its own: a terminal that takes no event does not hold it up.
+    announcers = [Announcer(each, clock) for each in ([record], [*logs, *sinks])]
+    sink = fan_out(*map(stack.enter_context, announcers))
+    for device, description in ready.info.devices.items():
+        if settings := description.get(FOUND):
+            sink(Warned(f"{device}: before it was opened: {settings}."))
+    return sink
 
 
 def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> tuple[Sink, Sink, Sink]:
