@@ -73,21 +73,22 @@ def enough_views(source: ScanSource) -> Iterator[Finding]:
 
 def references_present(source: ScanSource) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
-    path = Path(source.path).absolute()
-    others = [each.name for each in path.parent.glob("*/") if each != path] if path.is_dir() else []
-    beside = ", ".join(sorted(name for name in others if re.search("dark|flat|white|open.?beam", name.lower()))[:4])
-    way = f" Beside it lie {beside}: {path.parent} is read with all of them." if beside else ""
-    if source.quantity != "counts":
-        if source.quantity == "unknown" and way:
-            yield Finding("error", "references", f"Darks and flats may be elsewhere.{way}")
-        return
+    if source.quantity == "unknown" and (path := Path(source.path).absolute()).is_dir():
+        others = [each.name for each in path.parent.glob("*/") if each != path]
+        beside = ", ".join(sorted(name for name in others if re.search("dark|flat|white|open.?beam", name.lower()))[:4])
+        if beside:
+            yield Finding("error", "references", f"Beside it lie {beside}: --quantity counts takes their images, too.")
+    if "beside" in source.attributes:
+        said = f"Darks and flats are those beside the views: {source.attributes['beside']}."
+        yield Finding("info", "references", said)
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
-        if not source.table.of_kind(kind).size:
+        if source.quantity == "counts" and not source.table.of_kind(kind).size:
             yield Finding(
                 "error",
                 "references",
-                f"Counts without {name}: give --{name} FILE (or a folder). If the frames were divided by their flats, "
-                f"say --quantity transmission, or line-integrals where their logarithm was taken.{way}",
+                f"Counts without {name}: give --{name} FILE, a folder, or their counts as one number where none were "
+                "taken. If the frames were divided by their flats, say --quantity transmission, or line-integrals "
+                "where their logarithm was taken.",
             )
 
 
