@@ -108,6 +108,11 @@ class Projections:
             lit[at[view], row, first:end] = False
         return None if lit.all() else lit
 
+    @property
+    def measured(self) -> NDArray[np.float32]:
+        """The line integrals, NaN where a pixel measured nothing."""
+        return self.data if (lit := self.lit) is None else np.where(lit, self.data, np.float32(np.nan))
+
 
 class Correction:
     """Correction of one scan's views, which come in the order they were taken, in batches of any size.

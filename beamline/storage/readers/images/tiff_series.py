@@ -312,7 +312,7 @@ def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
         views = [Path(above.names[i]).parts[0] for i in above.table.views]
         beside = sorted({Path(name).parts[0] for name in above.names} - {*views})
         if beside and {*views} == {source.path.absolute().name}:
-            above.facts |= {"beside": ", ".join(beside)}
+            above.facts = {**above.facts, "beside": ", ".join(beside)}
             return above
     return source
 

@@ -174,7 +174,7 @@ def test_references_in_folders_beside_the_views_are_taken_for_counts(tmp_path: P
     ):
         with open_scan(scan) as source:
             assert source.table.kinds.tolist() == kinds
-    said = {quantity: _of_references(SourceOptions(views, quantity, angles)) for quantity in ("counts", None)}  # type: ignore[arg-type]
+    said = {quantity: _of_references(SourceOptions(views, quantity, angles)) for quantity in ("counts", None)}
     assert said["counts"] == "Darks and flats are those beside the views: Dark_After, Flat_Before."
     assert said[None] == "Beside it lie Dark_After, Flat_Before: --quantity counts takes their images, too."
     _written(tmp_path / "Tomo_2", [f"IMAT_other_{i}.tif" for i in range(4)])  # whose flats are they?
