@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
-from beamline.core.text import count, spans
+from beamline.core.text import count, frames_text
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import current_scale
 from beamline.projections.open_beam import SHADOW_VIEWS, OpenBeam, count_references
@@ -286,9 +286,9 @@ class ScanCorrection:
         copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
         if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
             self._warn(
-                f"{count(len(copies), 'view')} of {self._source.table.views.size} (frames {spans(copies)}) hold the "
-                "pixels of the view before: the camera or its driver gave an image twice. Their angles are then wrong "
-                "for what they show: leave them out with --views or --flags judge, or repeat them."
+                f"{count(len(copies), 'view')} of {self._source.table.views.size} ({frames_text(copies)}) with the "
+                "pixels of the view before: the camera or its driver gave an image twice. Such angles are wrong for "
+                "what is shown: leave them out with --views or --flags judge, or repeat them."
             )
 
     def _no_view(self) -> NoViewError:
@@ -311,9 +311,9 @@ class ScanCorrection:
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self._source, asked, lit)) else ""
         self._named_unlit.update(news.tolist())
         self._warn(
-            f"{count(news.size, 'view')} of {self._source.table.views.size} (frames {spans(news.tolist())}) have no "
-            "light: the shutter was closed, the beam was gone, or the file was never written there. They are left "
-            f"out{gap}."
+            f"{count(news.size, 'view')} of {self._source.table.views.size} ({frames_text(news)}) without "
+            "light: the shutter was closed, the beam was gone, or the file was never written there. Such views are "
+            f"left out{gap}."
         )
 
     def _look_for_shadow(self, views: NDArray[np.int64]) -> None:

@@ -30,7 +30,7 @@ def angles_known(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "error",
             "angles",
-            f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]})"
+            f"{unknown.size} of {views.size} projections without an angle (first: frame {unknown[0]})"
             + (f"; {why}" if why else "")
             + ". Give them with --angles FILE (degrees, one a line).",
         )

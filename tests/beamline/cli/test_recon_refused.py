@@ -29,7 +29,7 @@ CASES: dict[str, tuple[dict[str, Any], list[str], int, str]] = {
     "all NaN": ({"data": np.full(_VIEWS, np.nan, np.float32)}, [], 5, "NaN"),
     "one view": ({"data": np.full((1, 2, 40), 9000, np.uint16), "theta": np.zeros(1)}, [], 5, "at least 2"),
     "no beam": ({"data_white": np.full((2, 2, 40), DARK, np.uint16)}, [], 5, "no beam"),
-    "black views": ({"data": _BLACK}, ["--axis", "20"], 5, "have no light"),
+    "black views": ({"data": _BLACK}, ["--axis", "20"], 5, "without light"),
     "empty field": ({"data": np.full(_VIEWS, DARK + BEAM, np.uint16)}, [], 5, "scan.h5"),
     "one view chosen": ({}, ["--views", "fixed:1"], 2, "at least 2"),
     "a gain of logarithms": ({}, ["--noise", "log", "--gain", "2"], 2, "--noise log"),
