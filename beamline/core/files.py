@@ -12,13 +12,14 @@ import stat
 import time
 import uuid
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, TextIO
 
 from beamline.core.errors import DataError
+from beamline.core.text import csv_text
 
 PART = "part-{}"  # The folder of a later part of a scan that was resumed, in that of the run
 OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
@@ -101,8 +102,7 @@ _SUBSTITUTES = {
 
 
 def refuse_substitute(path: Path) -> None:
-    """Raise DataError for a file that is empty, packed as a whole, or lies in the place of the data: a pointer to them,
-    or a web page."""
+    """Raise DataError for a file without the data: empty, packed as a whole, a pointer to them, or a web page."""
     with path.open("rb") as file:
         head = file.read(64).lower()
     why = "empty" if not head else next((why for begin, why in _SUBSTITUTES.items() if head.startswith(begin)), "")
@@ -159,13 +159,13 @@ def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
 
 
 def bytes_below(folder: Path, name: str, largest: int = TEXT) -> bytes:
-    """The content of the file that `open_below` opens, at most so many bytes."""
+    """The content of the file that `open_below` opens, at most `largest` bytes."""
     with open_below(folder, name, largest) as file:
         return file.read(min(largest, os.fstat(file.fileno()).st_size))
 
 
 def text_in(path: Path, largest: int = TEXT) -> str:
-    """The content of a text file of at most so many bytes. Raises OSError as `require_regular`, and for text that is
+    """The content of a text file of at most `largest` bytes. Raises OSError as `require_regular`, and for text that is
     not UTF-8.
 
     A byte-order mark, which some editors write, tells UTF-16, and is no part of the text.
@@ -175,7 +175,7 @@ def text_in(path: Path, largest: int = TEXT) -> str:
         return decoded(path.read_bytes())
     except UnicodeDecodeError as error:
         raise OSError(
-            errno.EILSEQ, f"It is no UTF-8 text, by its byte {error.start}. Save it as UTF-8", str(path)
+            errno.EILSEQ, f"It is not UTF-8 text: byte {error.start} is not valid. Save it as UTF-8", str(path)
         ) from error
 
 
@@ -229,7 +229,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def refuse_not_utf8(path: Path | str) -> None:
-    """Raises DataError for a path whose bytes are no UTF-8, which results are to name."""
+    """Raise DataError for a path that is not UTF-8, since results must be able to name it."""
     try:
         str(Path(path).absolute()).encode()
     except UnicodeEncodeError as error:
@@ -328,6 +328,17 @@ def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> N
         bring_to_disk(partial)
         if partial.read_bytes() != data:
             raise OSError(errno.EIO, "what is read back is not what was written")
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, object]], names: Sequence[str] = ()) -> None:
+    """Write rows of values by name as a CSV file in place of an earlier one, see `text.csv_text`.
+
+    Args:
+        names: of the columns; empty: those of the first row.
+    """
+    columns = names or list(rows[0])
+    text = csv_text([columns, *([row[name] for name in columns] for row in rows)])
+    write_whole(path, text.encode("utf-8", "surrogateescape"), replace=True)
 
 
 def write_together(writes: Iterable[tuple[Path, Callable[[Path], object]]]) -> None:

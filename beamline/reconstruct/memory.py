@@ -90,7 +90,7 @@ class ReconMemory:
         return (self.raw + _COPIES * self.line_integrals) // self.geometry.n_views
 
     def slab(self, height: int) -> int:
-        """Memory of a slab of so many slices, with its views and weights; figures of merit need less."""
+        """Memory of a slab of `height` slices, with its views and weights; figures of merit need less."""
         halo = self.method.traits.halo
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)
@@ -143,7 +143,7 @@ class ReconMemory:
 
 
 def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
-    """The method for so many slices `of` a volume; `in_all` is the number of slices of all slabs, overlaps counted
+    """The method for `slices` slices `of` a volume; `in_all` is the number of slices of all slabs, overlaps counted
     twice.
     """
     return method_for_part(method, slices / of, slices / in_all)
@@ -156,7 +156,7 @@ def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
         ConfigError: the selection does not fit the scan.
         DataError: the poses do not.
     """
-    selection, method = options.selection, options.method
+    selection, method = options.selection.of(source), options.method
     geometry = stated_geometry(source, selection)
     pixel = source.dtype.itemsize if selection.binning == 1 else 4
     part = ScanPart(source, selection, geometry)

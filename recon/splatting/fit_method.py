@@ -50,7 +50,7 @@ class FitMethod(Method, Protocol):
         """Number of steps; None if a time ends the fit."""
 
     @property
-    def made_by(self) -> tuple[FitSettings, Mapping[str, Plain]]:
+    def provenance(self) -> tuple[FitSettings, Mapping[str, Plain]]:
         """All settings that determine the steps, which a resumed run must share, and more by name."""
 
     def for_trial(self, share: float, of_steps: float) -> Self:

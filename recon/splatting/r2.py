@@ -123,7 +123,7 @@ class R2(Checked):
         )
 
     @property
-    def made_by(self) -> tuple[FitSettings, Mapping[str, Plain]]:
+    def provenance(self) -> tuple[FitSettings, Mapping[str, Plain]]:
         assert not isinstance(self.gaussians, Gaussians)
         return self.fit, {"start": self.start, "gaussians": self.gaussians or 0}
 

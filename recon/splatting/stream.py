@@ -22,9 +22,9 @@ from recon.base.arrays import F32
 from recon.base.declared_types import check_arguments
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry, unseen_axis
-from recon.base.masks import masked
 from recon.base.method import Clock, Progress
 from recon.base.units import look_like_degrees, warn_of_degrees
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import (
@@ -334,7 +334,7 @@ class StreamingFit:
             return Volume(np.zeros(grid.shape, np.float32), grid)
         return fit.volume_of(averaged(self._state), grid, self._template, self._settings)
 
-    def shown(self) -> BetterVolume:
+    def best_preview(self) -> BetterVolume:
         """The volume that predicts held-out views better: that of the model, or FBP of the views so far."""
         if self._problem is None or self._state is None:
             return BetterVolume(self.snapshot(), False, PredictionErrors())
@@ -394,10 +394,10 @@ class StreamingFit:
 
         Views held out have no part in it, unless `all_views` do.
         """
-        every, (data, weights) = self._template.at(self._angles), masked(np.stack(self._data))
+        views = Views(np.stack(self._data), self._template.at(self._angles)).masked()
         learnt = [view for view in range(self.n_views) if all_views or not self._held_out[view]]
-        geometry, seen = every.select(learnt), data[learnt]
-        wider = sample_radius(data, every)
+        geometry, seen = views.geometry.select(learnt), views.data[learnt]
+        wider = sample_radius(views)
         box = self._grid if wider is None else self._grid.reaching(wider.radius, self._template)
         field = Grid.for_fit(self._template, box, wider=wider is not None)
         coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / PLACED_FROM) / 3))
@@ -417,7 +417,7 @@ class StreamingFit:
             radius = geometry.reach if wider is None else math.inf
             placed = sample_gaussians(volume, count, self._rng, field_radius=radius, kernel=kernel)
             placed = scale_to_data(placed, seen, geometry)
-        self._problem = fit.problem_of(data, every, field, placed.density_unit, self._settings, weights=weights)
+        self._problem = fit.problem_of(views, field, placed.density_unit, self._settings)
         self._state, self._schedule_step = fit.init(placed, self._rng), 0
         self._placed = placed.n
         self._data, self._unseen = [], []  # the problem holds them from now on

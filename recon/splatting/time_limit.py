@@ -108,7 +108,7 @@ def planned_finish(method: FitMethod, remaining: float, steps: float, problem: R
 
 
 @dataclass(frozen=True, eq=False)
-class LastRound:
+class FinalFit:
     """The last round of a fit, over the views that it was already fitted to, and the sweeps after it.
 
     Attributes:
