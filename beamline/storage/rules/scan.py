@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -73,11 +71,6 @@ def altered_sentence(source: ScanSource) -> str:
 
 def references_present(scan: ScanEvidence) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
-    if scan.source.quantity == "unknown" and (path := Path(scan.source.path).absolute()).is_dir():
-        others = [each.name for each in path.parent.glob("*/") if each != path]
-        beside = ", ".join(sorted(name for name in others if re.search("dark|flat|white|open.?beam", name.lower()))[:4])
-        if beside:
-            yield Finding("error", "references", f"Beside it lie {beside}: --quantity counts takes their images, too.")
     if "beside" in scan.source.attributes:
         said = f"Darks and flats are those beside the views: {scan.source.attributes['beside']}."
         yield Finding("info", "references", said)

@@ -174,9 +174,8 @@ def test_references_in_folders_beside_the_views_are_taken_for_counts(tmp_path: P
     ):
         with open_scan(scan) as source:
             assert source.table.kinds.tolist() == kinds
-    said = {quantity: _of_references(SourceOptions(views, quantity, angles)) for quantity in ("counts", None)}
-    assert said["counts"] == "Darks and flats are those beside the views: Dark_After, Flat_Before."
-    assert said[None] == "Beside it lie Dark_After, Flat_Before: --quantity counts takes their images, too."
+    said = _of_references(SourceOptions(views, "counts", angles))
+    assert said == "Darks and flats are those beside the views: Dark_After, Flat_Before."
     _written(tmp_path / "Tomo_2", [f"IMAT_other_{i}.tif" for i in range(4)])  # whose flats are they?
     assert "Counts without flats: give --flats FILE" in _of_references(SourceOptions(views, "counts", angles))
 
