@@ -26,7 +26,7 @@ def angles_unknown(scan: ScanEvidence) -> str:
     unknown = np.setdiff1d(views := scan.table.views, scan.table.views_with_angles)
     why = f"; {why}" if (why := scan.source.attributes.get("angles")) else ""
     return "" if not unknown.size else (
-        f"{unknown.size} of {views.size} projections without an angle (first: frame {unknown[0]}){why}. Give them with "
+        f"No angle for {unknown.size} of {views.size} projections (first: frame {unknown[0]}){why}. Give them with "
         "--angles FILE (degrees, one a line)."
     )  # fmt: skip
 
