@@ -129,6 +129,6 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 
 
 def frames_text(frames: Iterable[int]) -> str:
-    """Rows of a file as `frame 3` or `frames 3, 7`."""
-    numbers = [str(int(frame)) for frame in frames]
-    return ("frame " if len(numbers) == 1 else "frames ") + ", ".join(numbers)
+    """Rows of a file as `frame 3` or `frames 3, 7-9`."""
+    rows = [int(frame) for frame in frames]
+    return f"{'frame' if len(rows) == 1 else 'frames'} {spans(rows)}"

@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from beamline.core.sinks import Warn
-from beamline.core.text import count, spans
+from beamline.core.text import count, frames_text
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import ScanSelection
@@ -242,7 +242,7 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
     if odd.any() and (high - low <= tolerance or odd.mean() < _FEW):
         most = shown.mass[odd][np.abs(shown.mass[odd]).argmax()]
         sentence = (
-            f"{count(int(odd.sum()), 'view')} of {odd.size} looked at (frames {spans(frames[odd].tolist())}) hold "
+            f"{count(int(odd.sum()), 'view')} of {odd.size} looked at ({frames_text(frames[odd])}) with "
             f"{most:+.1%} matter beside the others, at most, {because}: something else stood in the beam, or the light "
             "is wrong. Look at them; --views leaves them out."
         )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
-from beamline.core.text import count, spans
+from beamline.core.text import count, frames_text, spans
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ViewFilter, ViewStep
 from beamline.projections.registry import in_order
@@ -232,9 +232,9 @@ class ViewReader:
         copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
         if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
             self.warn(
-                f"{count(len(copies), 'view')} of {self.scan.source.table.views.size} (frames {spans(copies)}) hold "
-                "the pixels of the view before: the camera or its driver gave an image twice. Their angles are then "
-                "wrong for what they show: leave them out with --views or --flags judge, or repeat them."
+                f"{count(len(copies), 'view')} of {self.scan.source.table.views.size} ({frames_text(copies)}) with "
+                "the pixels of the view before: the camera or its driver gave an image twice. Such angles are wrong "
+                "for what is shown: leave them out with --views or --flags judge, or repeat them."
             )
 
     def tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
@@ -245,9 +245,9 @@ class ViewReader:
         gap = f", and{gap_text}" if (gap_text := gap_sentence(self.scan.source, asked, lit)) else ""
         self.named.update(news.tolist())
         self.warn(
-            f"{count(news.size, 'view')} of {self.scan.source.table.views.size} (frames {spans(news.tolist())}) have "
-            "no light: the shutter was closed, the beam was gone, or the file was never written there. They are left "
-            f"out{gap}."
+            f"{count(news.size, 'view')} of {self.scan.source.table.views.size} ({frames_text(news)}) without "
+            "light: the shutter was closed, the beam was gone, or the file was never written there. Such views are "
+            f"left out{gap}."
         )
 
     def no_view(self) -> NoViewError:

@@ -8,7 +8,7 @@ import numpy as np
 
 from beamline.core.quantities import doubt
 from beamline.core.sinks import Note, Warn
-from beamline.core.text import count, spans
+from beamline.core.text import count, frames_text, spans
 from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.poses import ScanPoses
@@ -109,7 +109,7 @@ def report_defects(prepared: PreparedProjections, first_row: int, binning: int, 
         ends = np.unique(runs[:, 2:], axis=0) * binning
         cols = spans(np.unique(np.concatenate([np.arange(*each) for each in ends])).tolist(), 4)
         warn(
-            f"In {count(frames.size, 'view')} of {projections.view_ids.size} (frames {spans(frames.tolist())}) pixels "
+            f"In {count(frames.size, 'view')} of {projections.view_ids.size} ({frames_text(frames)}) pixels "
             f"of columns {cols} and rows {rows} measured nothing: zeros or values that are not finite at a border, as "
             "where views were shifted or turned before, or something opaque in the beam that is not the sample, such "
             "as a post or a clamp. These rays have no weight."

@@ -197,9 +197,9 @@ class ScanFollower:
         assert self._correction is not None and self._fit is not None
         batch, newest = self._correction.feed(frames, last=last), self._cursor.newest
         if batch is not None:
-            data, views = batch.data, batch.view_ids
+            data, views = batch.measured, batch.view_ids
             if newest is not None:
-                if not np.array_equal(data[0], newest.data[0]):
+                if not np.array_equal(data[0], newest.measured[0], equal_nan=True):
                     self._fit.replace_newest(data[0])
                 data, views, newest = data[1:], views[1:], None
             self._cursor = replace(self._cursor, batches=(*self._cursor.batches, batch), newest=None)
@@ -207,7 +207,7 @@ class ScanFollower:
                 self._fit.add_views(data, self._angles(views))
         if newest is None and (newest := self._correction.newest()) is not None:
             self._cursor = replace(self._cursor, newest=newest)
-            self._fit.add_views(newest.data, self._angles(newest.view_ids))
+            self._fit.add_views(newest.measured, self._angles(newest.view_ids))
 
     def catch_up(self, should_stop: Callable[[], bool]) -> None:
         """Read the remaining frames of a scan that has ended; after a stop, only those that a volume needs."""
@@ -230,7 +230,7 @@ class ScanFollower:
         self._sink(ReconStarted(self.source.path, options.method.name, self.views.n, axis_col, again, time=now))
         fit = options.streaming.stream(self._selection.geometry(axis_col, _ONE_VIEW), options.seed, self._clock.now)
         for batch in self._cursor.batches:
-            fit.add_views(batch.data, self.views.angles(axis_col, batch.view_ids))
+            fit.add_views(batch.measured, self.views.angles(axis_col, batch.view_ids))
         self._cursor = replace(self._cursor, newest=None)  # the next views bring it again
         return fit
 
@@ -260,7 +260,7 @@ class ScanFollower:
         self._correction = self._correction.renewed(every := np.union1d(frames, wide))
         again = self._correction.at_once(every)
         self._cursor = replace(self._cursor, batches=(again,))
-        ordinary = again.data[~np.isin(again.view_ids, wide)] if wide.size else again.data
+        ordinary = again.measured[~np.isin(again.view_ids, wide)] if wide.size else again.measured
         self._fit.replace_views(ordinary, kept if gone else None)
 
     def advance(self, seconds: float) -> bool:
@@ -383,7 +383,7 @@ class ScanFollower:
                     continue
                 if done[step.name].sentence:
                     self._tell({step.name: done[step.name]})
-                    self._fit.replace_views(prepared.ordinary.projections.data)
+                    self._fit.replace_views(prepared.ordinary.projections.measured)
         return replace(prepared, done=done)
 
     def _tell(self, done: Mapping[str, StepDone]) -> None:

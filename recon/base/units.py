@@ -13,6 +13,7 @@ from recon.base.views import spread
 HC = 1.239841984e-6  # keV mm: wavelength in mm times photon energy (CODATA 2018)
 _TURNS = 10  # fewer are no reason for doubt, unless all angles are whole numbers
 _FEWEST = 5  # with fewer views there is no warning
+_ROUND = 0.01  # of a turn or half of one, within which angles go round it
 _OPAQUE = 15.0  # exp(-15) of the light, which no detector measures in nine of ten pixels
 _LOOKED_AT = 2**16  # values
 _VIEWS, _ROWS, _VALUES = 32, 64, 2**21  # of a scan, in which transmission is looked for
@@ -40,6 +41,13 @@ def look_like_degrees(angles: NDArray[np.floating], ended: bool = True) -> bool:
     whole = span + span / (distinct.size - 1)
     turns = ended and any(abs(s / turn - 1) < 1e-3 for s in (span, whole) for turn in (180, 360))
     return bool(round_numbers or turns)
+
+
+def gone_round(angles: NDArray[np.floating], turn: float) -> float:
+    """Half a `turn`, or one, which distinct angles [view] go round, with or without the last of them; else 0."""
+    span = float(np.ptp(angles)) if angles.size >= _FEWEST else 0.0
+    spans = span, span + span / max(angles.size - 1, 1)
+    return next((part for part in (turn / 2, turn) if min(abs(each / part - 1) for each in spans) < _ROUND), 0.0)
 
 
 def warn_of_degrees(angles: NDArray[np.floating], ended: bool = True) -> None:

@@ -109,6 +109,11 @@ class Projections:
             lit[at[view], row, first:end] = False
         return None if lit.all() else lit
 
+    @property
+    def measured(self) -> NDArray[np.float32]:
+        """The line integrals, NaN where a pixel measured nothing."""
+        return self.data if (lit := self.lit) is None else np.where(lit, self.data, np.float32(np.nan))
+
 
 @dataclass(frozen=True, eq=False)
 class CorrectionPlan:

@@ -83,18 +83,18 @@ _ONE_IN = 16  # of so many views one is held out until the last round
 
 
 def checked_views(data: ArrayLike, angles: NDArray[np.float64], detector_shape: tuple[int, int]) -> F32:
-    """A copy of new line integrals [view, row, col] as float32.
+    """A copy of new line integrals [view, row, col] as float32; NaN: a pixel measured nothing.
 
     Raises:
-        ValueError: shapes that disagree, or values or angles [view] that are not finite.
+        ValueError: shapes that disagree, infinite values, a view of NaN alone, or angles [view] that are not finite.
     """
     expected = (angles.size, *detector_shape)
     if angles.ndim != 1 or np.shape(data) != expected:
         raise ValueError(f"{angles.size} angles need projections of shape {expected}, got {np.shape(data)}")
     with np.errstate(over="ignore"):  # what float32 cannot hold counts as not finite
         images = np.array(data, np.float32)
-    if not (np.isfinite(images).all() and np.isfinite(angles).all()):
-        raise ValueError("new views hold values or angles that are not finite; nothing was changed")
+    if np.isinf(images).any() or np.isnan(images).all(axis=(1, 2)).any() or not np.isfinite(angles).all():
+        raise ValueError("new views hold infinite values or nothing but NaN, or angles not finite; nothing was changed")
     return images
 
 

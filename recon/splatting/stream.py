@@ -141,8 +141,10 @@ class StreamingFit:
     def add_views(self, data: F32, angles: ArrayLike) -> None:
         """Add line integrals [k, row, col] at angles [k] in radians; they are used from the next step on.
 
+        Pixels that measured nothing are NaN: they have no weight.
+
         Raises:
-            ValueError: where shapes disagree with the template, values are not finite, or a view holds nothing but
+            ValueError: where shapes disagree with the template, values are infinite, or a view holds nothing but NaN or
                 values far too large; nothing is added.
 
         Warns:
@@ -171,7 +173,7 @@ class StreamingFit:
             self.unlearnt = (1 - _NEW) * kept + _NEW * left
 
     def newest_view(self) -> tuple[F32, F32]:
-        """The newest view and the model's render of it, line integrals [row, col].
+        """The newest view and the model's render of it, line integrals [row, col]; equal where nothing was measured.
 
         Raises:
             ValueError: there is no model yet.
@@ -180,7 +182,9 @@ class StreamingFit:
             raise ValueError("there is no model yet that could be compared with the newest view")
         problem = self._problem
         (image,) = fit.renders(averaged(self._state), problem, self._settings, [self.n_views - 1])
-        return problem.images[-1] * problem.scale, problem.backend.numpy(image) * problem.scale
+        measured, weight = problem.images[-1] * problem.scale, problem.weights[-1]
+        rendered: F32 = problem.backend.numpy(image) * problem.scale
+        return measured, rendered if weight is None else np.where(weight == 0, measured, rendered)
 
     def replace_views(self, data: F32, kept: ArrayLike | None = None) -> None:
         """Replace the line integrals [view, row, col] of all views so far, in order: their correction has changed.
@@ -190,7 +194,7 @@ class StreamingFit:
         count from then on, and the rates start again, because the model has learnt from bad views.
 
         Raises:
-            ValueError: where the shape is not that of the views, or values are not finite; nothing is changed.
+            ValueError: as `add_views`, or there are no views; nothing is changed.
         """
         which = np.arange(self.n_views) if kept is None else np.asarray(kept, np.intp)
         theta = np.asarray(self._angles)[which]
@@ -214,8 +218,8 @@ class StreamingFit:
         changed = total = 0.0
         for view, image in zip(which, images, strict=True):
             before = self._problem.backend.numpy(self._problem.images[view]) * self._problem.scale
-            changed += float(np.square(image - before, dtype=np.float64).sum())
-            total += float(np.square(image, dtype=np.float64).sum())
+            changed += float(np.nansum(np.square(image - before, dtype=np.float64)))
+            total += float(np.nansum(np.square(image, dtype=np.float64)))
         return changed > _OTHERS**2 * total
 
     def replace_newest(self, data: F32) -> None:
@@ -361,7 +365,8 @@ class StreamingFit:
             # The sample or the beam came later, so the density unit is noise. Or so few views place Gaussians badly.
             blind = max(float(image.max()) for image in self._problem.images) > _BLIND
             if blind or (not force and self.n_views < _YOUNG and self._state.step >= HALF):
-                self._data = list(self._problem.projections)
+                views = zip(self._problem.projections, self._problem.weights, strict=True)
+                self._data = [view if w is None else np.where(w == 0, np.float32(np.nan), view) for view, w in views]
                 self._place_first(None if blind else self._state, all_views=force)
         assert self._state is not None
         # Later views need new Gaussians: early ones span a narrow angle and would use all of them for their streaks.
@@ -389,10 +394,10 @@ class StreamingFit:
 
         Views held out have no part in it, unless `all_views` do.
         """
-        every, data = self._template.at(self._angles), np.stack(self._data)
+        views = Views(np.stack(self._data), self._template.at(self._angles)).masked()
         learnt = [view for view in range(self.n_views) if all_views or not self._held_out[view]]
-        geometry, seen = every.select(learnt), data[learnt]
-        wider = sample_radius(Views(data, every))
+        geometry, seen = views.geometry.select(learnt), views.data[learnt]
+        wider = sample_radius(views)
         box = self._grid if wider is None else self._grid.reaching(wider.radius, self._template)
         field = Grid.for_fit(self._template, box, wider=wider is not None)
         coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / PLACED_FROM) / 3))
@@ -412,7 +417,7 @@ class StreamingFit:
             radius = geometry.reach if wider is None else math.inf
             placed = sample_gaussians(volume, count, self._rng, field_radius=radius, kernel=kernel)
             placed = scale_to_data(placed, seen, geometry)
-        self._problem = fit.problem_of(Views(data, every), field, placed.density_unit, self._settings)
+        self._problem = fit.problem_of(views, field, placed.density_unit, self._settings)
         self._state, self._schedule_step = fit.init(placed, self._rng), 0
         self._placed = placed.n
         self._data, self._unseen = [], []  # the problem holds them from now on

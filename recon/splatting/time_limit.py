@@ -83,8 +83,11 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     sweep = sweep_seconds(geometry, grid, now)
     before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
     choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
-    most = before + (FINISH_SWEEPS + patches.iterations) * sweep + choice * patches.trial_sweeps / CHOICE_SWEEPS
-    if choice and most <= min(seconds, beside_steps):
+    most, room = before + FINISH_SWEEPS * sweep, seconds
+    if choice:  # else views are too few to hold some out, and patches are not tried
+        most += patches.iterations * sweep + choice * patches.trial_sweeps / CHOICE_SWEEPS
+        room = min(seconds, beside_steps)
+    if most <= room:
         return FinishPlan(None, most)
     trials = before + choice + FINISH_SWEEPS * sweep <= seconds
     before += choice if trials else 0.0

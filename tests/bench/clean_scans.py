@@ -134,7 +134,8 @@ def clean_scan(seed: int, change: Change = lambda t, balls: balls, **fixed: obje
     if kind["beam"] == "cone":
         source.cone, source.pixel_size_mm = (6 * half * 0.001, 12 * half * 0.001), 0.002
     why = {"always", *(name for name in ("wide", "exposed") if kind[name])}
-    why |= {"few"} if n < 30 or kind["order"] == "repeated" else set()
+    directions = n // (2 if kind["beam"] == "full" and n % 2 == 0 else 1)  # half a turn apart they are the same
+    why |= {"few"} if directions < 30 or kind["order"] == "repeated" else set()
     why |= {"faint"} if kind["depth"] < 0.5 or kind["depth"] > 3 or kind["light"] < 300 else set()
     return source, why | {str(kind)}
 

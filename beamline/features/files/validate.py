@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from beamline.core.errors import DataError, damaged, user_message
-from beamline.core.text import count, spans
+from beamline.core.text import count, frames_text, spans
 from beamline.features.files.frame_log import framestamp_order, time_order
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known
@@ -119,7 +119,7 @@ def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "unlit",
-            f"{len(unlit)} of {of} (frames {spans(unlit)}) have no light: the shutter was closed, the beam was gone, "
+            f"{len(unlit)} of {of} ({frames_text(unlit)}) without light: the shutter was closed, the beam was gone, "
             f"or the file was never written there. `beamline recon` leaves such views out.{more}",
         )
 

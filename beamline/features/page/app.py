@@ -69,6 +69,10 @@ class Access:
     ended: Event = field(default_factory=Event)  # set when the server ends
 
 
+KNOWN = "splatline.known"
+"""In the scope of a request with the viewing token, which its connection reads, too."""
+
+
 class Guard:
     """Sets the headers of every response, and refuses requests for another host, or without the viewing token."""
 
@@ -91,6 +95,7 @@ class Guard:
         if request.headers.get("host") not in self._access.hosts:  # a foreign name that leads here
             await Response("Not a name of this server.\n", 421, media_type="text/plain")(scope, receive, send)
         elif _same(request.cookies.get(self._cookie, ""), self._access.look):
+            scope[KNOWN] = True
             await self._app(scope, receive, send_with_headers)
         elif request.url.path == "/" and _same(request.query_params.get("token", ""), self._access.look):
             answer: Response = RedirectResponse("/", 303)

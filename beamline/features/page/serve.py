@@ -29,7 +29,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from beamline.core.errors import ConfigError, DataError
-from beamline.features.page.app import Access, begins_with, guarded, page_routes
+from beamline.features.page.app import KNOWN, Access, begins_with, guarded, page_routes
 from beamline.page.run_files import Reader, watched
 from beamline.scan.runs import HEAD, cells, describe, runs_in
 
@@ -39,6 +39,7 @@ process of macOS may open 256 files."""
 _AT_ONCE, _WAITING = 32, 256
 """Connections that asyncio accepts before it serves them, and that wait in the system. At 1000 new ones a second, 95 of
 100 requests of the owner took up to 1.6 s where 1024 wait, 0.2 s where 256 do."""
+_KNOWN_STAYS = 3600  # s without a request
 OPEN_RUNS = 8
 """Runs whose files stay open without anybody who watches."""
 
@@ -130,7 +131,19 @@ def open_port(bind: str, port: int) -> socket.socket:
 
 
 class _Connection(H11Protocol):
-    """A connection that gives way to newer ones while it is idle, so that nobody who sends nothing locks others out."""
+    """A connection that gives way to newer ones while it is idle, so that nobody who sends nothing locks others out.
+
+    One by which somebody with the token has asked stays open for an hour, and gives way last: a stop then needs no new
+    connection, which may take seconds while thousands of others are made.
+    """
+
+    @property
+    def known(self) -> bool:
+        return self.cycle is not None and KNOWN in self.cycle.scope
+
+    def on_response_complete(self) -> None:
+        self.timeout_keep_alive = _KNOWN_STAYS if self.known else self.config.timeout_keep_alive
+        super().on_response_complete()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -138,7 +151,7 @@ class _Connection(H11Protocol):
         there: list[Any] = [each for each in self.connections if not each.transport.is_closing()]
         idle = [each for each in there if each.cycle is None or each.cycle.response_complete]
         if idle and len(there) > CONNECTIONS:
-            min(idle, key=attrgetter("since")).transport.abort()
+            min(idle, key=attrgetter("known", "since")).transport.abort()
 
 
 class _Server(uvicorn.Server):

@@ -224,11 +224,13 @@ class Opening:
         follow: the file may still be growing.
         own_angles: the file's angles are used; False: the caller brings them, so the file may lack them.
         one_series: the caller says the kind of each frame; names of files say none.
+        counts: the caller says that pixels are counts, and gives no references: they may lie beside the views.
     """
 
     follow: bool = False
     own_angles: bool = True
     one_series: bool = False
+    counts: bool = False
 
 
 @dataclass(frozen=True)

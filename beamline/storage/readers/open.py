@@ -173,7 +173,8 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
     """The frames of all files, of the kinds that the caller says."""
     kinds, _ = kinds_and_views(options.frames)
-    opening = Opening(follow, options.angles is None and options.angles_path is None, kinds is not None)
+    own_angles, given = options.angles is None and options.angles_path is None, (options.darks, options.flats)
+    opening = Opening(follow, own_angles, kinds is not None, options.quantity == "counts" and given == (None, None))
     with ExitStack() as opened:
 
         def file(path: Path) -> ScanSource:

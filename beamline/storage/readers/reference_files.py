@@ -68,7 +68,7 @@ def stated_references(
     if base.dtype.kind != "f":
         raise DataError(
             f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
-            "stands for 1, give an image of it with --flats, one of 0 with --darks, and leave out --quantity."
+            "stands for 1, give it as --flats 65535 or the like, with --darks 0, and leave out --quantity."
         )
     return nothing, np.ones_like(nothing)
 

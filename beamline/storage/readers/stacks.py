@@ -6,6 +6,7 @@ projections.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -35,6 +36,7 @@ from beamline.storage.readers.orders import (
 from beamline.storage.superblock import marked_as_being_written
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F64
+from recon.base.units import gone_round
 
 
 @dataclass(frozen=True)
@@ -158,8 +160,24 @@ def open_stacks(
         lists = [item.name for item in arrays_of(file) if item.ndim == 1 and item.size == len(stacks[-1].frames)]
         if lists and angles is None:
             source.facts = {**facts, "angles": f"--angles-path {lists[0]} takes those of {', '.join(lists[:_LISTED])}"}
+        if isinstance(file, ArrayFile) and angles is None:
+            _take_angles(source, [file[name] for name in lists if _ANGLES.search(name)])
         _take_geometry(source, views)
         return source
+
+
+def _take_angles(source: StacksSource, lists: list[NamedArray]) -> None:
+    """Take the one list that is named so, in the unit that it states, or in which it goes round half a turn or one."""
+    if len(lists) != 1:
+        return
+    item, values, turns = lists[0], np.unique(lists[0][...]), {"rad": 2 * np.pi, "deg": 360.0}
+    unit = item.attrs.get("units") or next((unit for unit, turn in turns.items() if gone_round(values, turn)), "")
+    if unit:
+        source.table.angles[source.table.views] = datasets.radians(item, default=unit)
+        source.facts = {**source.facts, "angles_from": f"{item.name}, in {unit}"}
+
+
+_ANGLES = re.compile("angle|theta", re.IGNORECASE)
 
 
 def _take_geometry(source: StacksSource, views: Any) -> None:

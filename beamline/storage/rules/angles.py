@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 
 from beamline.storage.rules import Finding, Severity
 from beamline.storage.rules.evidence import ScanEvidence
-from recon.base.units import look_like_degrees
+from recon.base.units import gone_round, look_like_degrees
 
 FARTHEST = 1e6  # degrees
 _GAP = 0.5  # degrees without a view beyond the others, of views in even steps
 _SAME = 0.1  # of the mean step: views so close are one
+_EQUAL, _FEW = 1e-3, 4  # degrees between views of one direction; columns of the detector to a direction
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
-_FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
+_MANY = 30  # views from which on a span tells that it is in no degrees
 
 
 def angles_unknown(scan: ScanEvidence) -> str:
@@ -25,7 +26,7 @@ def angles_unknown(scan: ScanEvidence) -> str:
     unknown = np.setdiff1d(views := scan.table.views, scan.table.views_with_angles)
     why = f"; {why}" if (why := scan.source.attributes.get("angles")) else ""
     return "" if not unknown.size else (
-        f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]}){why}. Give them with "
+        f"No angle for {unknown.size} of {views.size} projections (first: frame {unknown[0]}){why}. Give them with "
         "--angles FILE (degrees, one a line)."
     )  # fmt: skip
 
@@ -74,7 +75,7 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
             severity,
             "angle-spread",
             f"{angles.size} projections span only {span:.4g} degrees: {unit} Give them in degrees with --angles FILE "
-            "(one a line).",
+            "(one a line), or say --angles-unit rad with it.",
         )
     elif (unseen := half_turn_unseen(angles)) > 0:
         span_text = (
@@ -86,6 +87,20 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
             f"The projections {span_text} (limited angle): {unseen:.4g} of 180 degrees have no view."
             + (_COUNTED if not scan.source.plan and np.allclose(degrees, np.arange(angles.size)) else ""),
         )
+    elif scan.cone is None and (n := directions(angles)) <= min((distinct.size + 1) / 2, scan.source.shape[1] / _FEW):
+        yield Finding(
+            "warning",
+            "angle-spread",
+            f"Views half a turn apart see the same rays: in steps of {step:.4g} degrees, {distinct.size} views see "
+            f"{n} directions only, few for {scan.source.shape[1]} columns. FBP leaves streaks there: compare with "
+            "--method fista-tv. A step that does not divide 180 degrees sees more directions.",
+        )
+
+
+def directions(angles: NDArray[np.float64]) -> int:
+    """The directions of rays that parallel views [view], in rad, see: half a turn later they are the same."""
+    half = np.mod(np.degrees(angles), 180.0)
+    return int(np.unique(np.round(np.where(half > 180.0 - _EQUAL, 0.0, half) / _EQUAL)).size)
 
 
 def half_turn_unseen(angles: NDArray[np.float64]) -> float:
@@ -112,9 +127,6 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
 
 def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
     """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
-    span = float(degrees[-1] - degrees[0])
-    whole = span + span / (degrees.size - 1)
-    for part, name in ((np.pi, "half a turn"), (2 * np.pi, "a turn")):
-        if n >= _FEWEST and min(abs(span / part - 1), abs(whole / part - 1)) < 0.01:
-            return f"these look like radians: {name} is {part:.5g}."
-    return "these look like radians or turns." if n > _MANY and span <= 2 * np.pi else None
+    if part := gone_round(degrees, 2 * np.pi):
+        return f"these look like radians: {'half a turn' if part < 4 else 'a turn'} is {part:.5g}."
+    return "these look like radians or turns." if n > _MANY and np.ptp(degrees) <= 2 * np.pi else None

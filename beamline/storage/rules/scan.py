@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -73,21 +71,17 @@ def altered_sentence(source: ScanSource) -> str:
 
 def references_present(scan: ScanEvidence) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
-    path = Path(scan.source.path).absolute()
-    others = [each.name for each in path.parent.glob("*/") if each != path] if path.is_dir() else []
-    beside = ", ".join(sorted(name for name in others if re.search("dark|flat|white|open.?beam", name.lower()))[:4])
-    way = f" Beside it lie {beside}: {path.parent} is read with all of them." if beside else ""
-    if not scan.in_counts:
-        if scan.source.quantity == "unknown" and way:
-            yield Finding("error", "references", f"Darks and flats may be elsewhere.{way}")
-        return
+    if "beside" in scan.source.attributes:
+        said = f"Darks and flats are those beside the views: {scan.source.attributes['beside']}."
+        yield Finding("info", "references", said)
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
-        if not scan.table.of_kind(kind).size:
+        if scan.in_counts and not scan.table.of_kind(kind).size:
             yield Finding(
                 "error",
                 "references",
-                f"Counts without {name}: give --{name} FILE (or a folder). If the frames were divided by their flats, "
-                f"say --quantity transmission, or line-integrals where their logarithm was taken.{way}",
+                f"Counts without {name}: give --{name} FILE, a folder, or their counts as one number where none were "
+                "taken. If the frames were divided by their flats, say --quantity transmission, or line-integrals "
+                "where their logarithm was taken.",
             )
 
 

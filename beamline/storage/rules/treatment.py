@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.flag import PixelBox
-from beamline.core.text import count, spans
+from beamline.core.text import count, frames_text, spans
 from beamline.monitor.check import Level
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
@@ -127,10 +127,7 @@ def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:
         return
     message += f" Frames with an alarm: {spans(rows.tolist())}."
     if again.size:
-        verb = "was" if again.size == 1 else "were"
-        message += (
-            f" {count(again.size, 'view')} {verb} taken again, and the first (frames {spans(again.tolist())}) not used."
-        )
+        message += f" Taken again: {count(again.size, 'view')}; the first ({frames_text(again)}) not used."
         rows = np.setdiff1d(rows, again)
         if not rows.size:
             yield Finding("info", FLAGS, f"{message} No other frame has an alarm.")

@@ -73,7 +73,7 @@ def test_file_info_and_validate_count_them(tmp_path: Path) -> None:
     assert (facts["first_angle_deg"], facts["last_angle_deg"]) == (0, pytest.approx(168.75, abs=0.01))
     (found,) = [finding for finding in validate(path) if finding.rule == "flags"]
     assert found.severity == "info"
-    assert "3 views were taken again, and the first (frames 8-9, 20) not used." in found.message
+    assert "Taken again: 3 views; the first (frames 8-9, 20) not used." in found.message
     with h5py.File(path) as file:
         assert list(file["entry/frame_log/replaces"][FIRST + N :]) == [8, 9, 20, -1, -1]
         assert list(file["entry/frame_log/trigger"][FIRST + N : FIRST + N + 3]) == [16, 17, 18]

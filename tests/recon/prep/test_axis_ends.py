@@ -73,6 +73,16 @@ def test_steps_too_wide_for_the_sample_leave_it_uncertain_and_noise_too() -> Non
         assert not axis_from_ends(noise, half_turn(90)).confident
 
 
+def test_noise_of_flats_that_the_views_share_is_no_matter() -> None:
+    """Flats of both ends are interpolated: views side by side share their noise, and join by it within the scan."""
+    can, time = 0.3 * np.sqrt(1 - ((np.arange(COLS) - 47.5) / COLS) ** 2), np.linspace(0, 1, 90)[:, None, None]
+    for seed in range(5, 9):
+        rng = np.random.default_rng(seed)
+        change, first = rng.normal(0, 0.04, (2, ROWS, COLS))
+        views = can + time * change + first + rng.normal(0, 0.05, (90, ROWS, COLS))
+        assert not axis_from_ends(views, half_turn(90)).confident
+
+
 @pytest.mark.parametrize("part", [slice(0, 100), np.delete(np.arange(120), range(40, 44)), slice(0, 31)])
 def test_a_sector_a_gap_and_few_views_have_no_ends_that_join(part: slice | NDArray[np.int_]) -> None:
     views, angles = grains(4, 1.5, half_turn(120), 47.5), half_turn(120)

@@ -82,6 +82,25 @@ def test_the_volume_grows_with_the_views_and_ends_well(data: np.ndarray, phantom
     assert end.n_views == 40 and end.residual < 0.05
 
 
+def test_pixels_that_measured_nothing_have_no_weight(data: np.ndarray, phantom: Phantom) -> None:
+    """A post in the beam of every third view: its columns are NaN, or filled."""
+    truth, unseen, quality = phantom.attenuation(GRID), data.copy(), []
+    unseen[::3, :, 12:20] = np.nan
+    for views in (unseen, np.nan_to_num(unseen)):
+        model = StreamingFit(VIEWS, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
+        for first in range(0, 40, 10):
+            model.add_views(views[first : first + 10], ANGLES[first : first + 10])
+            model.replace_newest(views[first + 9])
+            model.advance(0.1)
+        model.replace_views(views)
+        assert np.isfinite(model.unlearnt)
+        model.finish(0.3)
+        quality.append(psnr(truth, model.snapshot().data))
+    assert quality[0] > quality[1] + 3
+    with pytest.raises(ValueError, match="nothing but NaN"):
+        model.add_views(np.full((1, *SHAPE), np.nan, np.float32), ANGLES[:1])
+
+
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_volume(data: np.ndarray, streamed: tuple[np.ndarray, float]) -> None:
     np.testing.assert_array_equal(_stream(data, SCATTERED).snapshot().data, streamed[0])
@@ -146,7 +165,7 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
     with pytest.raises(ValueError, match="shape"):
         model.add_views(data[:2], ANGLES[:3])
     bad = data[:1].copy()
-    bad[0, 3, 3] = np.nan
+    bad[0, 3, 3] = np.inf
     with pytest.raises(ValueError, match="nothing was changed"):
         model.add_views(bad, ANGLES[:1])
     with pytest.raises(ValueError, match="nothing was changed"):

@@ -298,8 +298,23 @@ _BESIDE = "a view half a turn from the first, taken beside the series: the axis 
 def _open(path: Path, opening: Opening) -> ScanSource:
     if path.suffix.lower() == _PICTURE and path.is_file():
         return Frames(TiffSeriesSource(path.parent, listed=[path.name]), path=path)
-    scene = _scene_of(path)
-    return _with_values(TiffSeriesSource(path, one_series=opening.one_series)) if scene is None else _open_scene(scene)
+    if (scene := _scene_of(path)) is not None:
+        return _open_scene(scene)
+    source = TiffSeriesSource(path, one_series=opening.one_series)
+    alone = opening.counts and source.in_order and path.is_dir() and not opening.one_series
+    return _with_values(_with_references_beside(source) if alone else source)
+
+
+def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
+    """The scan of the folder above, where its views are those of this one, and others are darks or flats."""
+    with suppress(DataError):
+        above = TiffSeriesSource(source.path.absolute().parent)
+        views = [Path(above.names[i]).parts[0] for i in above.table.views]
+        beside = sorted({Path(name).parts[0] for name in above.names} - {*views})
+        if beside and {*views} == {source.path.absolute().name}:
+            above.facts = {**above.facts, "beside": ", ".join(beside)}
+            return above
+    return source
 
 
 def _with_values(source: TiffSeriesSource) -> ScanSource:

@@ -123,9 +123,14 @@ def test_a_choice_reaches_a_scan_that_asks_and_no_other(tmp_path: Path) -> None:
 def test_connections_without_the_token_lock_nobody_out(
     run: Path, sent: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Three times as many as are kept, which say nothing, stop in the middle of a request, or stay after an answer."""
+    """Three times as many as are kept, which say nothing, stop in the middle of a request, or stay after an answer.
+
+    The owner's connections stay, and need not be made anew.
+    """
     with served(run, control=True) as page, ExitStack() as stack:
         host, port = page.host.rsplit(":", 1)
+        kept = stack.enter_context(closing(http.client.HTTPConnection(page.host, timeout=20)))
+        asked_by(kept, page)
         with page_feed(page) as feed:
             opened = [stack.enter_context(socket.create_connection((host, int(port)))) for _ in range(3 * CONNECTIONS)]
             for connection in opened:
@@ -134,9 +139,15 @@ def test_connections_without_the_token_lock_nobody_out(
             begin = time.monotonic()
             assert page.ask("/api/facts")[0] == 200
             assert act(page, "stop") == 403  # without the token for acting
+            asked_by(kept, page)
             assert time.monotonic() - begin < 2
             assert feed.read(1)  # a page that is open stays so
     assert len(capfd.readouterr().err) < 1000
+
+
+def asked_by(connection: http.client.HTTPConnection, page: Served) -> None:
+    connection.request("GET", "/api/facts", headers={"Cookie": f"{page.cookie}={page.token}"})
+    assert (answer := connection.getresponse()).status == 200 and answer.read()
 
 
 @contextmanager

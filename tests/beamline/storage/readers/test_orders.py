@@ -136,6 +136,15 @@ def test_lists_of_a_file_that_may_be_its_angles_are_named(tmp_path: Path) -> Non
     assert "--angles-path /theta takes those of /theta" in said
 
 
+def test_angles_of_an_array_file_are_taken_in_the_unit_in_which_they_go_round(tmp_path: Path) -> None:
+    for degrees, taken in ((np.arange(6) * 60.0, True), (np.arange(6) * 30.0, True), (np.arange(6) * 7.0, False)):
+        for name, values in (("deg", degrees), ("rad", np.radians(degrees))):
+            np.savez(path := tmp_path / f"{name}.npz", projections=np.zeros((6, 4, 5)), theta=values, x=np.arange(6))
+            with open_scan(path) as source:
+                expected = np.radians(degrees) if taken else np.full(6, np.nan)
+                np.testing.assert_allclose(source.table.angles, expected)
+
+
 def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
     counts = VIEWS.astype(np.uint16)
     for name, lines in (("s", counts[:, 0]), ("w", counts[:3, 1]), ("k", counts[:1, 2])):

@@ -36,10 +36,10 @@ def found(path: Path, **how: object) -> set[tuple[str, str]]:
     return {(finding.severity, finding.rule) for finding in validate(SourceOptions(path, **how))}  # type: ignore[arg-type]
 
 
-def with_theta(folder: Path, theta: np.ndarray, units: str | None = None) -> Path:
+def with_theta(folder: Path, theta: np.ndarray, units: str | None = None, cols: int = 5) -> Path:
     """Noise under these angles."""
     with h5py.File(folder / "s.h5", "w") as file:
-        file["exchange/data"] = np.random.default_rng(0).integers(1, 900, (theta.size, 4, 5)).astype(np.uint16)
+        file["exchange/data"] = np.random.default_rng(0).integers(1, 900, (theta.size, 4, cols)).astype(np.uint16)
         file["exchange/theta"] = theta
         if units is not None:
             file["exchange/theta"].attrs["units"] = units
@@ -199,6 +199,15 @@ def test_angles_that_cannot_be_degrees(tmp_path: Path, theta: np.ndarray, said: 
     path = with_theta(tmp_path, np.full(theta.size, np.nan))
     (hit,) = angles_told(SourceOptions(path, angles=tmp_path / "a.txt"))
     assert hit.severity == "error" and said in hit.message and "--angles FILE" in hit.message
+
+
+@pytest.mark.parametrize(
+    ("views", "turns", "said"),
+    [(30, 1, "of 12 degrees, 30 views see 15 directions"), (60, 5, "see 6 directions"), (31, 1, ""), (60, 1, "")],
+)
+def test_opposite_views_of_a_few_are_one_direction(tmp_path: Path, views: int, turns: int, said: str) -> None:
+    path = with_theta(tmp_path, np.arange(views) * turns * 360 / views, cols=64)
+    assert [said in hit.message for hit in angles_told(SourceOptions(path))] == [True] * bool(said)
 
 
 @settings(max_examples=60, deadline=None)

@@ -163,13 +163,25 @@ def test_images_that_are_not_read_are_named_with_a_way(tmp_path: Path) -> None:
             open_scan(tmp_path / name)
 
 
-@pytest.mark.parametrize("quantity", ["counts", None])
-def test_folders_of_references_beside_the_views_are_named(tmp_path: Path, quantity: str | None) -> None:
+def test_references_in_folders_beside_the_views_are_taken_for_counts(tmp_path: Path) -> None:
     for name in ("Tomo", "Flat_Before", "Dark_After"):
         _written(tmp_path / name, [f"IMAT_{name}_{i}.tif" for i in range(4)])
-    found = validate(SourceOptions(tmp_path / "Tomo", angles=np.arange(4.0), quantity=quantity))  # type: ignore[arg-type]
-    said = " ".join(each.message for each in found if each.rule == "references")
-    assert f"Beside it lie Dark_After, Flat_Before: {tmp_path} is read with all of them" in said
+    views, angles = tmp_path / "Tomo", np.arange(4.0)
+    for scan, kinds in (
+        (SourceOptions(views, "counts", angles), [1] * 4 + [0] * 4 + [2] * 4),
+        (SourceOptions(views, "counts", angles, flats=views), [1] * 4 + [0] * 4),
+        (SourceOptions(views, "line_integrals", angles), [0] * 4),
+    ):
+        with open_scan(scan) as source:
+            assert source.table.kinds.tolist() == kinds
+    said = _of_references(SourceOptions(views, "counts", angles))
+    assert said == "Darks and flats are those beside the views: Dark_After, Flat_Before."
+    _written(tmp_path / "Tomo_2", [f"IMAT_other_{i}.tif" for i in range(4)])  # whose flats are they?
+    assert "Counts without flats: give --flats FILE" in _of_references(SourceOptions(views, "counts", angles))
+
+
+def _of_references(scan: SourceOptions) -> str:
+    return " ".join(each.message for each in validate(scan) if each.rule == "references")
 
 
 def test_other_images_beside_tiffs_are_no_frames(tmp_path: Path) -> None:
