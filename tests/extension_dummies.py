@@ -27,15 +27,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from recon.base.method import Reconstruction, Traits
+from recon.base.method import Reconstruction
+from recon.base.method_kinds import Direct
 from recon.base.volume import Volume
 
 
 @dataclass(frozen=True)
-class Grey:
+class Grey(Direct):
     name: ClassVar[str] = "grey"
     label: ClassVar[str] = "Grey"
-    traits: ClassVar[Traits] = Traits(direct=True)
     iterations: int = 1
     shade: float = 0.5
 

@@ -163,7 +163,7 @@ def _run(
         except KeyboardInterrupt:
             if not slices:
                 raise
-        slab, direct = cut[0].selection.rows, cut[0].method.traits.direct
+        slab, direct = cut[0].selection.rows, not cut[0].method.fitted
         scores = scores_of(slices, direct=direct)
         for sentence in _remarks(slices, scores, options, direct=direct):
             answer.warn(sentence)

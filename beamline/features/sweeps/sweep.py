@@ -110,7 +110,7 @@ def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
     Raises:
         ConfigError, DataError: a scan or a selection that is refused.
     """
-    halo = max(min(trial.method.traits.halo, (_TALLEST - 1) // 2) for trial in trials)
+    halo = max(min(trial.method.halo, (_TALLEST - 1) // 2) for trial in trials)
     return [replace(trial, selection=_middle(trial, halo)) for trial in trials]
 
 
