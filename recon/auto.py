@@ -9,9 +9,9 @@ import numpy as np
 
 from recon.base.choices import AUTO, Quality
 from recon.base.decisions import Decisions
-from recon.base.declared_types import NonNegative
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
+from recon.base.setting import NonNegative
 from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import CANDIDATES, by_name

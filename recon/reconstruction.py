@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import some_values, without_mask
-from recon.base.declared_types import Natural, check_arguments
+from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry, require_views, unseen_axis
 from recon.base.masks import RayWeights
 from recon.base.method import (
@@ -21,6 +21,7 @@ from recon.base.method import (
     Reconstruction,
     RunControl,
 )
+from recon.base.setting import Natural
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.view_data import Views
 from recon.base.volume import Grid

@@ -9,10 +9,10 @@ from typing import ClassVar, Self
 
 from recon.assess.time_model import PRESETS
 from recon.base.choices import Quality, Start
-from recon.base.declared_types import Count, Natural, NonNegative
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl
+from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.splatting.anytime import while_views_come
 from recon.splatting.finish import FINISH_SWEEPS

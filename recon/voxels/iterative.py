@@ -21,10 +21,10 @@ from numba import get_num_threads, set_num_threads
 
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
-from recon.base.declared_types import Count
 from recon.base.geometry import Geometry, require_views
 from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Iterative
+from recon.base.setting import Count
 from recon.base.volume import Grid, Volume
 from recon.voxels.choice import MOST_TRIALS
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices

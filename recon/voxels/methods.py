@@ -10,10 +10,10 @@ from typing import ClassVar
 
 from recon.base.arrays import F32
 from recon.base.decisions import GoesOn, Prior
-from recon.base.declared_types import Count, Natural, NonNegative
 from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.geometry import Geometry
 from recon.base.method import Plain
+from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Prediction, TrialChoice

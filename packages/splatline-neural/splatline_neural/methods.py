@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon import Geometry, Grid, Progress, Reconstruction, RunControl, Volume
-from recon.base.declared_types import Count, NonNegative, Positive
 from recon.base.method import ReconProblem
 from recon.base.method_kinds import Iterative
+from recon.base.setting import Count, NonNegative, Positive
 from recon.splatting.initialise import first_volume
 from recon.voxels.voxel_problem import density_unit
 from splatline_neural.networks import F32, Field, HashGrid, Waves, drawn, rays_of

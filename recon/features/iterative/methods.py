@@ -12,8 +12,8 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
-from recon.base.declared_types import Count, Natural, NonNegative, Positive
 from recon.base.method import Plain
+from recon.base.setting import Count, Natural, NonNegative, Positive
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import VoxelMethod

@@ -10,10 +10,10 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.declared_types import Bound, Count, NonNegative
 from recon.base.geometry import Geometry
 from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Series
+from recon.base.setting import Count, NonNegative, Setting
 from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.features.joint.series import LEAST_VIEWS, SWEEPS, TimedViews, fit_series
 
@@ -39,7 +39,7 @@ class TimeSeries(Series):
     label: ClassVar[str] = "Volumes in time"
     least_views: ClassVar[int] = LEAST_VIEWS
 
-    volumes: Annotated[int, Bound(2)] = 2
+    volumes: Annotated[int, Setting(ge=2)] = 2
     moves: bool | None = None
     sweeps: Count = SWEEPS
     weight: NonNegative | None = None

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.stages.settings import key
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.stages.zaber.stage import ZaberStage
+from recon.base.setting import setting
 
 
 @dataclass(frozen=True)
 class SiteStageSettings(ZaberSettings):
     """The site's stage: a Zaber with a brake."""
 
-    brake: float = key(0.1, "How long its brake takes.", unit="s", ge=0)
+    brake: float = setting(0.1, "How long its brake takes.", unit="s", ge=0)
 
 
 class SiteStage(ZaberStage):

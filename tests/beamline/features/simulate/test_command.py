@@ -195,7 +195,7 @@ def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
     [
         (("nowhere", "--explain"), 2, "There is no file nowhere, and scene 'nowhere' is unknown; legal: battery, "),
         (("scene.yaml",), 2, "Nothing to do. Give --explain"),
-        (("broken.yaml", "--explain"), 2, "scene.beam: key 'photons' is unknown"),
+        (("broken.yaml", "--explain"), 2, "scene.beam.photons is not a known key"),
         (("scene.yaml", "--truth", "t.h5", "--truth-bin", "64"), 2, "--truth-bin: "),
         (("scene.yaml", "--out", "new.h5", "--set", f"effects=[{FRINGES}]"), 2, "the wave would alias"),
         (("scene.yaml", "--out", "there.h5", "--truth", "t.h5"), 5, "there.h5 exists"),

@@ -56,7 +56,7 @@ def test_battery_repeats_with_its_seed_and_refuses_what_does_not_fit() -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"field_of_view": [0.0, 1.0]}, r"field_of_view\[0\] must be greater than"),
+        ({"field_of_view": [0.0, 1.0]}, r"field_of_view.0 is 0.0; expected a number >"),
     ],
 )
 def test_wrong_settings_are_refused(wrong: dict[str, Any], words: str) -> None:

@@ -189,8 +189,8 @@ def test_tables_are_loaded_only_where_a_material_is_named() -> None:
         ([POOL | {"material": 5}], {"energy_kev": 8}, r"solids\[0\]: material must be text"),
         ([GREY | {"name": 5}], {}, r"solids\[0\]: name must be text, got"),
         ([POOL, GREY | {"instead_of": "Al"}], {"energy_kev": 8}, "instead_of 'Al' needs a material"),
-        ([POOL, "box"], {"energy_kev": 8}, r"solids\[1\] \(box\): key 'edges' is missing"),
-        ([POOL | {"colour": 1}], {"energy_kev": 8}, r"solids\[0\] \(cylinder\): key 'colour' is unknown"),
+        ([POOL, "box"], {"energy_kev": 8}, r"solids\[1\] \(box\).edges is missing"),
+        ([POOL | {"colour": 1}], {"energy_kev": 8}, r"solids\[0\] \(cylinder\).colour is not a known key"),
         ([POOL], {"energy_kev": 900}, "tabulated from 0.1 to 800 keV"),
         (
             [POOL],

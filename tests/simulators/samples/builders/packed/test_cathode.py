@@ -127,7 +127,7 @@ def test_in_a_beam_with_energies_parts_are_materials() -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"size_um": 0}, "size_um must be greater than or equal to 0.000001"),
+        ({"size_um": 0}, "size_um is 0; expected a number >= 1e-06"),
         ({"size_um": 100, "fill": 0.5, "diameter": 0.11}, "does not fit"),
         ({"size_um": 300}, "larger than the whole fill"),
         ({"hollow": 0.7, "cracked": 0.7}, "1 at most in sum"),

@@ -100,7 +100,7 @@ def test_in_a_beam_with_energies_holes_are_air() -> None:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"diameter": 0}, "diameter must be greater than"),
+        ({"diameter": 0}, "diameter is 0; expected a number >"),
         ({"smallest_um": 100}, "from largest_um down"),
         ({"attenuation": {"foam": 1.0}}, "part of this phantom 'foam' is unknown"),
     ],
