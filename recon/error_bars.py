@@ -90,16 +90,17 @@ def error_bars(
     factors = method.error_bars
     assert factors is not None
     made: Mapping[str, Sequence[Any]] = {}
+    classes = 1  # the noise of FBP knows no edges
     if not isinstance(method, VoxelMethod):
         difference = _alternating(method, problem)
     else:
+        classes = _CLASSES
         refitted = _refitted(method, problem, volume, decided, control)
         if refitted is None:
             return None
         difference, made = refitted
     gradient = _gradient(volume.data)
     decide = Decisions(problem.seed, decided)
-    classes = _CLASSES if method.fitted else 1  # the noise of FBP knows no edges
     limits = decide(_LIMITS, lambda: _limits(gradient, classes))
     np.square(difference, out=difference)
     variance = _averaged(difference, gradient, limits)

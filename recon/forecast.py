@@ -12,6 +12,7 @@ import numpy as np
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, Progress, ReconProblem, RunControl
+from recon.base.method_kinds import Direct, Series
 from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting.finish import FINISH_SWEEPS
@@ -82,7 +83,7 @@ def forecast(method: Method, geometry: Geometry, grid: Grid, now: Clock) -> Fore
     Raises:
         ValueError: the method does not take the views.
     """
-    return None if method.volumes > 1 else Timing(geometry, grid, now).of(method)
+    return None if isinstance(method, Series) else Timing(geometry, grid, now).of(method)
 
 
 class Timing:
@@ -107,7 +108,7 @@ class Timing:
             return self._of_choice(method.alternatives)
         if (limit := method.time_limit) is not None:
             return Forecast(0.0, {method.name: limit})
-        if not method.fitted:
+        if isinstance(method, Direct):
             return Forecast(0.0, {method.name: self.direct_seconds(method)})
         if isinstance(method, Fit):
             return self._of_fit(method)

@@ -14,6 +14,7 @@ from numba.core import event
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry, arrays_of
 from recon.base.method import DataUse, Method
+from recon.base.method_kinds import Series
 from recon.base.volume import Grid
 from recon.methods import DEFAULT, by_name
 from recon.reconstruction import reconstruct
@@ -56,7 +57,7 @@ def warm_up(
     method = method or by_name(DEFAULT)()
     if geometry is not None:
         method.views_wanted(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
-    data, views = toy_of(geometry, _SEVERAL if method.volumes > 1 else 1)
+    data, views = toy_of(geometry, _SEVERAL if isinstance(method, Series) else 1)
     where = str([value.tolist() for value in arrays_of(views).values()])
     with counted(on_kernel or (lambda n: None)):
         # A fit may end with patches.

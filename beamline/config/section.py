@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import MISSING
 from enum import StrEnum
 from pathlib import Path
 from types import UnionType
@@ -72,7 +73,7 @@ def _declared(made: Setting, kind: Any) -> tuple[Any, Any]:
         for each in (get_args(kind) if get_origin(kind) is UnionType else (kind,))
     )
     default = made.default.value if isinstance(made.default, StrEnum) else made.default
-    return Annotated[Union[tuple(members)], made], default  # noqa: UP007
+    return Annotated[Union[tuple(members)], made], ... if default is MISSING else default  # noqa: UP007
 
 
 def section_of(name: str, base: type[Section], keys: Mapping[str, Any], doc: str | None = None) -> Any:

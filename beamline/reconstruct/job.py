@@ -36,6 +36,7 @@ from recon.base.method import (
     Reconstruction,
     RunControl,
 )
+from recon.base.method_kinds import Series
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
@@ -302,7 +303,7 @@ def _is_early(job: Job, result: Reconstruction) -> bool:
     """Whether a stop ended the method before its last step."""
     method = job.method
     # The sweeps of a finish, and the factors of several volumes, follow the last step, and can be stopped as well.
-    if method.volumes > 1 or (isinstance(method, Fit) and method.finish_sweeps > 0):
+    if isinstance(method, Series) or (isinstance(method, Fit) and method.finish_sweeps > 0):
         return job.stop.stopped
     return job.stop.cut(*((result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)))
 

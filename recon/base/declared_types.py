@@ -94,7 +94,7 @@ def _alternatives(kind: Any) -> list[Any]:
 def _fits(value: Any, kind: Any) -> bool:
     origin, args = get_origin(kind) or kind, get_args(kind)
     if origin is Annotated:
-        return is_of_type(value, args[0]) and args[1].holds(value)
+        return is_of_type(value, args[0]) and not args[1].fault(value)
     if origin is Literal:
         return isinstance(value, str | int) and value in args
     if origin is int:

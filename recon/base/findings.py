@@ -21,9 +21,8 @@ _MANY = 2  # unknown keys of a group: more are those of another kind
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault: the path of its value, the path of the key that it is about, and a sentence without a full stop."""
+    """A fault: the path of the key that it is about, and a sentence without a full stop."""
 
-    path: KeyPath
     key: KeyPath
     sentence: str
 
@@ -67,7 +66,7 @@ def faults_of(
         else:
             sentence = _of_value(path, name or "the configuration", data, schema, missing)
         if all(fault.sentence != sentence for fault in faults.values()):  # one for all keys of a real device
-            faults.setdefault(path, Fault(path, key, sentence))
+            faults.setdefault(path, Fault(key, sentence))
     # A list with a wrong item may also seem too short.
     lists = {path for path in faults if isinstance(_value(data, path), list)}
     items = {path[:-1] for path in faults if path}

@@ -27,7 +27,7 @@ class Setting:
     """What a field or an argument declares of its value.
 
     Attributes:
-        default: in the unit of a configuration; `...`: it must be given.
+        default: in the unit of a configuration; `...`, or MISSING of dataclasses: it must be given.
         doc: its meaning, if the name does not tell.
         unit: in which a configuration writes it, which ends the name of its key; "" without one. Bounds are in it.
         gt, ge, lt, le: bounds of a number, which is finite.
@@ -60,14 +60,9 @@ class Setting:
             return f"from {self.ge:g} to {self.le:g}"
         return f"above {self.gt:g}" if self.gt is not None else f"of {self.ge:g} or more"
 
-    def holds(self, value: Any) -> bool:
-        """Whether a value has these bounds, in the unit of a configuration."""
-        finite = not isinstance(value, Real) or math.isfinite(value)
-        return finite and all(_WITHIN[name](value, bound) for name, bound in self.bounds.items())
-
     def fault(self, value: Any) -> str:
         """What is wrong with the value of a field; "" where nothing is."""
-        if isinstance(value, float) and not math.isfinite(value):
+        if isinstance(value, Real) and not -math.inf < float(value) < math.inf:
             return "expected a finite number"
         if value is None:
             return ""
@@ -135,11 +130,7 @@ def setting(default: Any = ..., doc: str = "", **rest: Any) -> Any:
 
 def settings_of(owner: Any) -> Mapping[str, Setting]:
     """What the fields of a dataclass declare, by name."""
-    return {each.name: each.metadata.get(_SETTING) or _undeclared(each) for each in dataclasses.fields(owner)}
-
-
-def _undeclared(field: dataclasses.Field[Any]) -> Setting:
-    return Setting(default=... if field.default is dataclasses.MISSING else field.default)
+    return {each.name: each.metadata.get(_SETTING, Setting(default=each.default)) for each in dataclasses.fields(owner)}
 
 
 class CheckedSettings:

@@ -24,14 +24,13 @@ class Fit(Iterative):
     takes: ClassVar[frozenset[str]] = frozenset({"device", "held_out", "checkpoints", "quality"})
     needs_matter: ClassVar[bool] = True
 
-    if TYPE_CHECKING:
-        steps: int | None
-        seconds: float | None
-        early_stop: bool
-        gaussians: int | Gaussians | None
-        start: Start
-        finish: int | None
-        fit: FitSettings
+    steps: int | None
+    seconds: float | None
+    early_stop: bool
+    gaussians: int | Gaussians | None
+    start: Start
+    finish: int | None
+    fit: FitSettings
 
     @property
     def time_limit(self) -> float | None:

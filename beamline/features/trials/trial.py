@@ -11,6 +11,7 @@ import numpy as np
 
 from beamline.features.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
+from recon.base.method_kinds import Direct
 from recon.methods import build, by_name
 
 Status = Literal["done", "failed", "interrupted", "not run"]
@@ -61,7 +62,7 @@ class MethodTrial:
     def in_time(self, seconds: float | None) -> MethodTrial:
         """The trial, to end after these seconds, if any; a direct method takes what it takes."""
         method = by_name(self.method)
-        if seconds is None or not method.fitted:
+        if seconds is None or issubclass(method, Direct):
             return self
         by_time = method.ended_by(seconds)
         kept = {name: value for name, value in self.settings.items() if name not in by_time}
