@@ -20,7 +20,7 @@ class FrameMemory:
         self._bytes = 0
 
     def prepare(self, n: int, shape: tuple[int, int]) -> None:
-        """Allocate memory for so many frames of a shape, with all pages present.
+        """Allocate memory for `n` frames of a shape, with all pages present.
 
         It replaces the kept buffers. Further frames allocate memory when they come.
 

@@ -51,7 +51,7 @@ class PlacedStage:
         return next((name for name in self._places.places if self._is_at(name)), None)
 
     def put(self, place: str, beside: float = 0.0) -> None:
-        """Move to a place, or so many radians beside it. Raises DeviceError if the stage did not arrive."""
+        """Move to a place, or `beside` radians beside it. Raises DeviceError if the stage did not arrive."""
         stage, speed, target = self._stage, self._places.speed, self._places.places[place] + beside
         try:
             if self._stands_at(target):

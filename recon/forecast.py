@@ -58,7 +58,7 @@ class Forecast(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """Seconds before and after the iterations of a run, and of each iteration; and the number that is planned."""
+    """Timing of a run: seconds beside its iterations, seconds of each iteration, and the number planned."""
 
     fixed: float
     each: float
@@ -228,12 +228,12 @@ def _work(geometry: Geometry, grid: Grid) -> float:
 
 
 def _covered(voxels: float, gaussians: float) -> float:
-    """Proportional to the pixels that Gaussians cover in a view, as wide as their distances."""
+    """A figure in proportion to the pixels that Gaussians as wide as their distances cover in a view."""
     return float(voxels ** (2 / 3) * gaussians ** (1 / 3))
 
 
 def _timed(method: Method, part: ReconProblem, now: Clock, last: int, after: int = 0) -> Pace:
-    """The pace of the iterations up to `last` that come after so many others, without trials."""
+    """The pace of the iterations from `after` to `last`, without trials."""
     reached: list[tuple[int, float]] = []
     planned = last
 

@@ -45,7 +45,7 @@ class Aspect(Flag):
 
 
 class TimeLeft(NamedTuple):
-    """A clock, and whether so many more seconds may be taken."""
+    """A clock, and whether a number of further seconds may be taken."""
 
     now: Clock = lambda: 0.0
     leaves: Callable[[float], bool] = lambda seconds: True
@@ -116,7 +116,7 @@ def judge(
         figures["unexplained"] = structure.share
 
     def has_time(work: float, name: str) -> bool:
-        """Whether there is time for as much work as that of projecting all views so often."""
+        """Whether time remains for this many projections of all views."""
         enough = work == 0 or time.leaves(work * seconds)
         skipped.extend([] if enough else [name])
         return enough

@@ -210,7 +210,8 @@ def grey_at(volume: F32, level: float, percentiles: tuple[float, float] = (0.5, 
 def enhanced_deviation(
     volume: F32, deviation: F32, percentiles: tuple[float, float] = (0.5, 99.5), gamma: float = 1.0
 ) -> F32:
-    """The standard deviation of the grey values of `enhanced`, of that of the voxels; the smoothing lowers it no more.
+    """The standard deviation of the grey values of `enhanced`, from that of the voxels; smoothing is not taken to lower
+    it further.
 
     Args:
         volume, deviation: [z, y, x] of the same unit.

@@ -27,7 +27,7 @@ from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import DEFAULT, accepting, by_name
 from recon.prep.counts import Counts, line_integrals
-from recon.voxels.beyond_field import run_in_box_of_sample
+from recon.voxels.beyond_field import run_on_extended_grid
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -94,7 +94,7 @@ def reconstruct(
     begin = control.now()
     views = Views(data, geometry, use.weights)
     problem = ReconProblem(views, grid, use, int(seed), device)
-    result = run_in_box_of_sample(chosen, problem, control)
+    result = run_on_extended_grid(chosen, problem, control)
     return replace(
         result, settings=dict(result.settings), method=result.method or chosen.name,
         seconds=result.seconds or control.now() - begin,
@@ -111,7 +111,7 @@ def _warn_of_unknown(data: NDArray[np.float32], weights: NDArray[np.float32] | R
     if 0 < lost < data.size:
         warnings.warn(
             f"{lost} of {data.size} values of the projections are not finite: they are filled from their neighbours "
-            "and weigh nothing. Give DataUse(weights) of 0 there, where that is known",
+            "and weigh nothing. If you know which they are, give them the weight 0 in DataUse(weights)",
             stacklevel=3,
         )
 
@@ -122,8 +122,8 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
     if some.sum(dtype=np.float64) < -np.abs(some).sum(dtype=np.float64) / 2:
         warnings.warn(
             f"projections are below 0 for the most part (mean {some.mean(dtype=np.float64):.4g}). Line integrals of "
-            "matter are above 0, -log of the transmission: change the sign. Of differences of views, methods that keep "
-            "no voxel below 0 need allow_negative",
+            "matter are above 0, -log of the transmission: change the sign. For differences of views, set "
+            "allow_negative in methods that keep no voxel below 0",
             stacklevel=3,
         )
 

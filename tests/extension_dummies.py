@@ -90,7 +90,7 @@ CHECK = Extension(
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.monitor.check import Flag, Level, Look, Policy
+from beamline.monitor.check import Flag, Level, CheckResult, Policy
 from recon.base.setting import setting
 
 
@@ -108,8 +108,8 @@ class Dummy:
 
     def look(self, state, frame, digest, context):
         if (state + 1) % self.every:
-            return Look(state + 1)
-        return Look(state + 1, Flag(self.name, Level.ALARM, frame.index, state + 1, self.every, "Do nothing."))
+            return CheckResult(state + 1)
+        return CheckResult(state + 1, Flag(self.name, Level.ALARM, frame.index, state + 1, self.every, "Do nothing."))
 '''
     },
     (("beamline/monitor/checks.py", '    "DarkCheck": "frames",', '    "Dummy": "dummy",'),),

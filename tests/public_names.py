@@ -59,7 +59,7 @@ FOR_PACKAGES = {
     "beamline.storage.readers.open": ("open_scan",),
     "beamline.storage.volumes.files": ("opened_volume", "write_volume"),
     "beamline.storage.volumes.base": ("Slices", "VolumeFormat", "bare_record"),
-    "beamline.monitor.check": ("Check", "Flag", "Level", "Look", "Policy", "ScanContext"),
+    "beamline.monitor.check": ("Check", "CheckResult", "Flag", "Level", "Policy", "ScanContext"),
     "beamline.testing": ("ReaderConformance",),
     "drivers.base.clock": ("Clock",),
     "drivers.base.errors": ("DeviceError", "DeviceRefused", "DeviceTimeout"),

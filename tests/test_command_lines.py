@@ -40,7 +40,7 @@ def refusal(line: str) -> str:
         command = command.get_command(context, name)
         if command is None:
             return f"no command {name}"
-        context = click.Context(command, context, info_name=name)
+        context = click.Context(command, context, info_name=name, **command.context_settings)
     assert command is not None
     if command.name == "sweep":  # its options are those of recon
         words = [word for word in words if not re.fullmatch(r"[a-z-]+=.*", word)]

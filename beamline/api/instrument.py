@@ -189,7 +189,7 @@ def _of_devices(config: Config) -> Mapping[str, Any]:
 
 
 def _result(events: Sequence[ScanDone | ReconDone]) -> ScanResult | None:
-    """The result of a scan by its events; None where it ended before its file was made."""
+    """The result of a scan, taken from its events; None if it ended before its file was made."""
     scan = next((event for event in events if isinstance(event, ScanDone)), None)
     recon = next((event for event in events if isinstance(event, ReconDone)), None)
     return None if scan is None else replace(scan.result, recon=None if recon is None else recon.values)

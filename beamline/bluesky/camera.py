@@ -54,7 +54,7 @@ class ShownFrames(StrictEnum):
 
 
 class _Frames(DetectorAcquireLogic):
-    """Frames from stage to unstage: set, armed, taken and written in a thread. `n`, `settings`: of the next ones."""
+    """Frames between stage and unstage, taken and written by a thread. `n`, `settings`: of the next ones."""
 
     def __init__(self, config: Config, instrument: ConnectedDevices, runs: Path | None) -> None:
         self._config, self._instrument = config, instrument
@@ -67,7 +67,7 @@ class _Frames(DetectorAcquireLogic):
         self.settings, self.n, self._apart = CameraSettings(config.scan.exposure_s, TriggerSource.SOFTWARE), 1, 0.0
 
     async def prepare(self, trigger: TriggerSource, n: int, exposure: float, apart: float = 0.0) -> None:
-        """Set the camera. `apart`: s between exposures. DeviceRefused: it does not take it."""
+        """Set the camera; `apart` is the time between exposures, s. Raises DeviceRefused if it does not accept that."""
         if n < 1:
             raise ValueError(f"the camera is prepared for {n} frames; expected 1 or more")
         wanted = camera_settings(self._config, exposure or self._config.scan.exposure_s, trigger)
@@ -118,7 +118,9 @@ class _Frames(DetectorAcquireLogic):
             self._task = None
 
     def _close(self, error: BaseException | None) -> None:
-        """Shutter, sample and file; the file says how many of the frames that were asked for it lacks, and why."""
+        """Close shutter and file, and bring the sample back; the file says how many of the requested frames it lacks,
+        and why.
+        """
         writer, self._writer = self._writer, None
         if writer is not None:
             try:
@@ -173,7 +175,7 @@ class _Frames(DetectorAcquireLogic):
             camera.disarm()
 
     def _next(self, patience: float) -> CameraFrame | None:
-        """The next frame; None where the frames are to end. DeviceTimeout: none has come for so many s."""
+        """The next frame; None once the frames are to end. Raises DeviceTimeout if none comes in time."""
         waited = 0.0
         while not self._stop.is_set():
             try:

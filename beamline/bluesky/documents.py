@@ -1,4 +1,4 @@
-"""Documents of bluesky (event-model) that tell a scan, whose frames stay in our file: one stream datum for new rows.
+"""Documents of bluesky (event-model) that describe a scan; its frames stay in our file, a stream datum names new rows.
 
 One index is one row of the file, darks and flats included. A trigger without a frame is no index.
 """

@@ -60,7 +60,7 @@ def _send(run: Path | None, word: str) -> None:
 
 
 def _decisions(part: Path, since: int) -> list[Mapping[str, Any]]:
-    """What the scan of a part has chosen, from this byte of its log on, oldest first; nothing where it has no log."""
+    """Choices of the scan of a part, oldest first, from this byte of its log on; none without a log."""
     from beamline.core.event_lines import event_in
 
     with suppress(OSError), open_below(part, EVENTS) as log:
@@ -70,8 +70,9 @@ def _decisions(part: Path, since: int) -> list[Mapping[str, Any]]:
 
 
 def _require_chosen(run: Path, part: Path, choice: str, before: int) -> None:
-    """Raise ConfigError where the scan, after so many bytes of its log, does not take this choice: it was not on offer,
-    or another one came first."""
+    """Raise ConfigError if the scan does not take this choice in its log from byte `before` on: it was not on offer, or
+    another one came first.
+    """
     for _ in range(_LOOKS):
         newer = _decisions(part, before)
         if choice in [decision.get("choice") for decision in newer]:
@@ -86,7 +87,7 @@ def _require_chosen(run: Path, part: Path, choice: str, before: int) -> None:
 @click.command()
 @click.argument("words", nargs=-1, required=True, metavar=f"[RUN] {'|'.join(CHOICES)}")
 def decide(words: tuple[str, ...]) -> None:
-    """Say what is measured next by the scan in the folder RUN (the running one of ./runs), while it asks.
+    """Tell the scan in the folder RUN (the running one of ./runs), while it asks, what to measure next.
 
     With `scan.decide: ask` a scan asks after each pass of views: the next pass of the plan, the angles of the last one
     again, the wide views, views that were flagged, or no further pass.
@@ -180,7 +181,7 @@ def home(file: Path, yes: bool, timeout: float, overrides: tuple[str, ...]) -> N
 @click.argument("file", type=click.Path(path_type=Path))
 @json_option
 def recover(file: Path, as_json: bool) -> None:
-    """Make an ordinary scan file of FILE, whose writer died, in its place; of the folder of a run, of all its files.
+    """Turn FILE, whose writer died, into an ordinary scan file; of the folder of a run, all its files.
 
     Every frame that was committed is kept; a frame that was being written is cut off. The file then opens in any
     program, has its /exchange view and the status `failed`. A file that is in order is left as it is. The frames

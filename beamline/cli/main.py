@@ -136,7 +136,8 @@ class _Lasting:
 
 
 class _Printable:
-    """A text stream that shows control characters instead of sending them, as names of files and texts in them hold.
+    """A text stream that shows the control characters of foreign names and texts instead of sending them to the
+    terminal.
 
     `unfiltered` is the stream itself, for a progress bar.
     """
@@ -151,9 +152,9 @@ class _Printable:
         return getattr(self.unfiltered, name)
 
 
-def outlast() -> None:
-    """Put `sys.stdout` and `sys.stderr` on streams that last, and that get printable text. Both, and stdin, are open
-    from now on.
+def guard_streams() -> None:
+    """Replace `sys.stdout` and `sys.stderr` by streams that outlive a closed terminal and print no control characters;
+    both, and stdin, are open from now on.
 
     The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
     """
@@ -178,7 +179,7 @@ def _nowhere() -> TextIO:
 
 
 def _command(name: str) -> CommandEntry | None:
-    """Other packages are asked, which takes a tenth of a second, only where the name is not ours."""
+    """The command of this name; other packages are searched (a tenth of a second) only if it is not ours."""
     return own_commands().get(name) or commands().get(name)
 
 
@@ -278,7 +279,7 @@ def run() -> NoReturn:
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
     os.environ["MPLBACKEND"] = "agg"  # that of a notebook that started this may be absent here: matplotlib refuses it
-    outlast()
+    guard_streams()
     code = 0
     try:
         main(prog_name="beamline")

@@ -85,6 +85,7 @@ class Declared(click.Option):
         excludes: long names of options that do not go with it, and why.
         needs: another option, without which this one means nothing, and the end of the sentence that says so.
         of_one_call: it is of one scan or call, and never part of a recipe.
+        former: its long name in the last version, which is still understood, and shown nowhere.
     """
 
     def __init__(
@@ -96,11 +97,17 @@ class Declared(click.Option):
         excludes: Mapping[str, str] = MappingProxyType({}),
         needs: tuple[str, str] | None = None,
         of_one_call: bool = False,
+        former: str = "",
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
         self.setting, self.argument, self.inverted = setting, argument, inverted
-        self.excludes, self.needs, self.of_one_call = excludes, needs, of_one_call
+        self.excludes, self.needs, self.of_one_call, self.former = excludes, needs, of_one_call, former
+
+    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
+        shown, self.opts = self.opts, [*self.opts, *filter(None, [self.former])]
+        super().add_to_parser(parser, ctx)
+        self.opts = shown
 
 
 def option(*names: str, **facts: Any) -> Decorator:

@@ -171,7 +171,8 @@ def run_reconstruction(
     stop = StopOnSignal(ready=options.follow is not None)
 
     def made(event: Event) -> None:
-        """Note when there is a volume: from the first step or iteration on; what has a unit is a trial, or slices.
+        """Note when a volume exists: from the method's own first step or iteration on (those of trials and slices have
+        a unit).
 
         Of several volumes there are some from the first trial on.
         """

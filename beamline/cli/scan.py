@@ -123,7 +123,7 @@ def scan(request: ScanRequest) -> None:
 
 
 def _scan_or_series(request: ScanRequest, json_sink: Sink, held: ExitStack) -> None:
-    """Take a scan, or those of its energies; or what a run lacks, which may be no more than to be joined."""
+    """Take a scan, or one at each energy; or complete a run, which may only need joining."""
     from beamline.config.load import load
     from beamline.scan.resume import NotJoined, open_for_resume, recover_run
 
@@ -234,7 +234,7 @@ def _queue() -> Any:
 
 @contextmanager
 def _shown(request: ScanRequest, others: Sequence[Sink], stop: StopRequest) -> Iterator[tuple[list[Sink], Ask]]:
-    """The terminal and the page beside a scan, as sinks before the `others`; and what asks the operator."""
+    """The sinks of a scan (terminal and page, then `others`), and the function that asks the operator."""
     from beamline.instrument.connect import ask_operator
 
     with stop_signals(stop), Terminal(sys.stderr) as terminal, PageBeside(terminal.say) as beside:
@@ -324,7 +324,7 @@ def faults_of(result: RunResult) -> list[str]:
 
 
 def _treated(path: Path) -> str:
-    """The treatment of flagged views by a reconstruction, in its own words; "" if the file does not tell."""
+    """How a reconstruction will treat flagged views, as a sentence; "" if the file does not say."""
     from beamline.storage.readers.open import open_scan
     from beamline.storage.rules.treatment import treatment_of
 

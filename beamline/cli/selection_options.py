@@ -87,7 +87,9 @@ scan_options = together(
         "0::2 or 1::2: every second view, with its darks and flats, where two exposures or thresholds alternate.",
     ),
     option(
-        "--then",
+        "--append",
+        "then",
+        former="--then",
         of_one_call=True,
         multiple=True,
         type=_PATH,
@@ -95,8 +97,9 @@ scan_options = together(
         help="A further file of the same scan, whose frames follow. May be repeated.",
     ),
     option(
-        "--from",
+        "--scanner-file",
         "side_file",
+        former="--from",
         of_one_call=True,
         type=_PATH,
         metavar="FILE",

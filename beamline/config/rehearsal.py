@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -72,11 +73,24 @@ def _plain(section: Section) -> dict[str, Any]:
 
 def _stage(stage: StageSection) -> dict[str, Any]:
     """The stage at the simulated controller's port, with a separate transcript to compare with the real one."""
-    values = _plain(stage) | {"port": f"sim://{stage.kind}"}
+    other = stage.settings.stand_in
+    values = (_stand_in(stage, other) if other else _plain(stage)) | {"port": f"sim://{other or stage.kind}"}
     if values.get("transcript"):
         path = Path(values["transcript"])
         values["transcript"] = str(path.with_name(f"{path.stem}{_MARK}{path.suffix}"))
     return values
+
+
+def _stand_in(stage: StageSection, kind: str) -> dict[str, Any]:
+    """A stage of another kind that turns as this one does, and gives pulses as close, from the same output."""
+    settings, limits = stage.settings, stage.settings.limits()
+    same = {"counts_per_turn", "max_speed_deg_s", "low_deg", "high_deg", "active_high", "timeout_s", "transcript"}
+    return stage.model_dump(mode="json", include=same) | {
+        "kind": kind,
+        "acceleration_deg_s2": math.degrees(limits.acceleration),
+        "firmware_pulse_s": limits.pulse_spacing / 2,
+        "trigger_line": settings.pulse_output,
+    }
 
 
 def _motor(motor: MotorSection) -> dict[str, Any]:

@@ -24,7 +24,8 @@ SPREAD = "spread"
 
 
 def spread(of: Callable[[Any], Mapping[str, Any]] = vars, made: type = dict, **of_field: Any) -> Any:
-    """A field whose own values stand in the line: a mapping, or what `of` makes of another value, here its attributes.
+    """A field whose values are written into the event's line one by one: those of a mapping, or what `of` makes of an
+    object (its attributes).
 
     Args:
         made: of the values in a line of another process.
@@ -234,7 +235,7 @@ class NextChosen(Event, event="next_chosen"):
 
 
 class Counted(Event, event="progress"):
-    """n of so many frames, slices, views or axes are done; `stage` names the work."""
+    """n of `of` frames, slices, views or axes are done; `stage` names the work."""
 
     stage: str
     n: int
@@ -244,7 +245,7 @@ class Counted(Event, event="progress"):
 
 
 class PhaseReached(Event, event="progress"):
-    """A phase of the work begins (n is 0), or n of so many `counted` are done. None: unknown."""
+    """A phase of the work begins (n is 0), or n of `of` items are done, which `counted` names. None: unknown."""
 
     stage: str
     counted: str
@@ -256,7 +257,7 @@ class PhaseReached(Event, event="progress"):
 
 
 class TrialReached(Event, event="progress"):
-    """n of so many trials, scans or runs are done, and `label` begins."""
+    """n of `of` trials, scans or runs are done, and `label` begins."""
 
     stage: str
     n: int

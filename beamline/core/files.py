@@ -101,8 +101,7 @@ _SUBSTITUTES = {
 
 
 def refuse_substitute(path: Path) -> None:
-    """Raise DataError for a file that is empty, packed as a whole, or lies in the place of the data: a pointer to them,
-    or a web page."""
+    """Raise DataError for a file without the data: empty, packed as a whole, a pointer to them, or a web page."""
     with path.open("rb") as file:
         head = file.read(64).lower()
     why = "empty" if not head else next((why for begin, why in _SUBSTITUTES.items() if head.startswith(begin)), "")
@@ -159,13 +158,13 @@ def open_below(folder: Path, name: str, largest: float = math.inf) -> BinaryIO:
 
 
 def bytes_below(folder: Path, name: str, largest: int = TEXT) -> bytes:
-    """The content of the file that `open_below` opens, at most so many bytes."""
+    """The content of the file that `open_below` opens, at most `largest` bytes."""
     with open_below(folder, name, largest) as file:
         return file.read(min(largest, os.fstat(file.fileno()).st_size))
 
 
 def text_in(path: Path, largest: int = TEXT) -> str:
-    """The content of a text file of at most so many bytes. Raises OSError as `require_regular`, and for text that is
+    """The content of a text file of at most `largest` bytes. Raises OSError as `require_regular`, and for text that is
     not UTF-8.
 
     A byte-order mark, which some editors write, tells UTF-16, and is no part of the text.
@@ -175,7 +174,7 @@ def text_in(path: Path, largest: int = TEXT) -> str:
         return decoded(path.read_bytes())
     except UnicodeDecodeError as error:
         raise OSError(
-            errno.EILSEQ, f"It is no UTF-8 text, by its byte {error.start}. Save it as UTF-8", str(path)
+            errno.EILSEQ, f"It is not UTF-8 text: byte {error.start} is not valid. Save it as UTF-8", str(path)
         ) from error
 
 
@@ -229,7 +228,7 @@ def refuse_existing(path: Path) -> None:
 
 
 def refuse_not_utf8(path: Path | str) -> None:
-    """Raises DataError for a path whose bytes are no UTF-8, which results are to name."""
+    """Raise DataError for a path that is not UTF-8, since results must be able to name it."""
     try:
         str(Path(path).absolute()).encode()
     except UnicodeEncodeError as error:

@@ -42,7 +42,9 @@ class Need:
 
     @staticmethod
     def in_turn(needs: Iterable[Need]) -> Need:
-        """The need of several works in turn: the largest memory and scratch space, and the sum of known seconds."""
+        """The need of pieces of work done one after the other: the largest memory and scratch space, and the sum of
+        known seconds.
+        """
         each = list(needs)
         return Need(
             memory=max((need.memory or 0 for need in each), default=0),

@@ -59,7 +59,7 @@ class PlausibleRange:
         return value == 0 or self.low / wider <= abs(value) <= self.high * wider
 
     def plausible_as(self, value: float) -> dict[str, float]:
-        """The value converted to this unit as if it were in another; by that unit, those that are plausible."""
+        """Plausible readings of the value: by each other unit that it may be in, its value in this unit."""
         return {other: value * factor for other, factor in self.others.items() if self.holds(value * factor)}
 
 

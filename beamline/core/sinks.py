@@ -95,7 +95,7 @@ _HELD = 60.0  # s after the first of them the frames so far are told
 
 
 class Narration:
-    """The events for people: those that say a finding of several frames again, with more of them, become one.
+    """Events for people; repeated findings on further frames are joined into one.
 
     It comes when the finding has ended, `_HELD` s after its first event, or before the end of a block or a command.
     """

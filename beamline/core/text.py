@@ -79,7 +79,7 @@ def spans(indices: Sequence[int], limit: int = 12) -> str:
 
 
 def with_points(numbers: Sequence[str]) -> list[str]:
-    """Numbers of one file with a point before their decimals, where all of them have a comma there.
+    """The numbers of a file as text with decimal points, if all of them have decimal commas.
 
     Raises:
         ValueError: the commas may group thousands, or separate numbers.

@@ -224,7 +224,7 @@ def connect(
 
 
 def clock_after(config: Config, time: float) -> Clock | None:
-    """The simulated clock, which starts anew in each process, from `time` (s since the Unix epoch) on; None: there is
+    """The simulated clock, started at `time` (s since the Unix epoch), as each process has its own; None: there is
     none.
     """
     if config.simulation is None:

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from beamline.monitor.change import FrameScatter, SampleChange
-from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, light, more_light
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, light, more_light
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import COVERED, DRIFT_STEP, CellGrid, CellView, brightest_place
 from drivers.base.frame import Frame, FrameKind
@@ -67,18 +67,18 @@ class BeamCheck(Logged):
 
     start = BeamState
 
-    def look(self, state: BeamState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[BeamState]:
+    def look(self, state: BeamState, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[BeamState]:
         if frame.kind is FrameKind.FLAT and context.flat is not None:
             full = float(light(context.flat, context).mean()) * more_light(context, frame.exposure)
             score = 1 - float(light(digest.preview, context).mean()) / full if full > 0 else 0.0
-            return Look(state, self._flat(frame.index, score))
+            return CheckResult(state, self._flat(frame.index, score))
         if context.view is None or context.grid is None:
-            return Look(state)
+            return CheckResult(state)
         state, flag = self._dip(state, frame.index, context.change, _whole(context.view, context.grid))
         if flag is None and context.grid.flats and not state.dipping:
             looked = self._drift(state, frame.index, brightest_place(context.view, context.grid), in_air(context))
             state, flag = looked.state, looked.flag
-        return Look(state, flag if flag is None or not context.integrals else _of_integrals(flag))
+        return CheckResult(state, flag if flag is None or not context.integrals else _of_integrals(flag))
 
     def _flat(self, row: int, score: float) -> Flag | None:
         if abs(score) <= self.drift:
@@ -108,32 +108,33 @@ class BeamCheck(Logged):
         )
         return replace(state, dipping=state.dipping + 1), Flag(self.name, Level.ALARM, row, score, limit, advice)
 
-    def _drift(self, state: BeamState, row: int, brightest: float, air: float) -> Look[BeamState]:
+    def _drift(self, state: BeamState, row: int, brightest: float, air: float) -> CheckResult[BeamState]:
         score = -math.expm1(-brightest)
         if math.isnan(air):
             if state.covered:
-                return Look(replace(state, drifting=0))
+                return CheckResult(replace(state, drifting=0))
             advice = (
                 f"No part of the frame gets more than {1 - score:.0%} of the flats' light. The sample covers all of "
                 "it, or the beam is weaker than in the flats. Its drift against the flats cannot be measured."
             )
-            return Look(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
+            return CheckResult(replace(state, covered=True), Flag(self.name, Level.INFO, row, score, COVERED, advice))
         gone = state.told != 0 and abs(score) < GONE * self.drift
         if not gone and abs(score) <= max(GROWN * abs(state.told), self.drift):
-            return Look(replace(state, drifting=0))
+            return CheckResult(replace(state, drifting=0))
         if state.drifting + 1 < LASTS:
-            return Look(replace(state, drifting=state.drifting + 1))
+            return CheckResult(replace(state, drifting=state.drifting + 1))
         if gone:
-            return Look(replace(state, drifting=0, told=0.0))
+            return CheckResult(replace(state, drifting=0, told=0.0))
         level = Level.INFO if state.told else Level.WARN  # a view is no worse for a drift that goes on
         advice = f"{_size(score)} light than in the flats, where there is air. {REMEDY}"
         flag = Flag(self.name, level, row, score, self.drift, advice)
-        return Look(replace(state, drifting=0, told=score), flag)
+        return CheckResult(replace(state, drifting=0, told=score), flag)
 
 
 def in_air(context: ScanContext) -> float:
-    """Line integral of the brightest place of a view, as logarithm of the light lost since the flats; NaN where it may
-    be matter: more than COVERED, and not what air has shown so far."""
+    """Line integral of the brightest place of a view (light lost since the flats); NaN if it may be matter: above
+    COVERED, and unlike the air so far.
+    """
     if context.view is None or context.grid is None or not context.grid.flats:
         return math.nan
     brightest = brightest_place(context.view, context.grid)

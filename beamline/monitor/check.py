@@ -118,7 +118,7 @@ def more_light(context: ScanContext, exposure: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Look(Generic[State]):
+class CheckResult(Generic[State]):
     """Result of a check of one frame: the check's state after it, and its finding (None: nothing to report)."""
 
     state: State
@@ -156,5 +156,5 @@ class Check(Protocol):
     def start(self) -> Any:
         """The state before the first frame."""
 
-    def look(self, state: Any, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[Any]:
+    def look(self, state: Any, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[Any]:
         """Check the next frame. Costs at most O(pixels of the preview)."""

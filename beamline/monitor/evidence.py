@@ -184,7 +184,7 @@ def pixel_noise(group: Group) -> float:
 
 
 def place_noise(values: NDArray[np.floating]) -> float:
-    """Standard deviation of a place by its neighbours along the row: matter and beam change more slowly."""
+    """Standard deviation of a place, by its neighbours along the row, as matter and beam change more slowly."""
     return deviation_between_neighbours(values, 2)
 
 
@@ -219,7 +219,7 @@ def full_scale(largest: float) -> float:
 
 
 def lights_in_turn(levels: NDArray[np.floating]) -> int:
-    """How many lights frames in a row [frame] have in turn, 2 or 3; 0: their light does not change so.
+    """Number of light levels between which consecutive frames [frame] alternate, 2 or 3; 0: they do not alternate.
 
     They do where the change to the next frame of the same light is a third at most: of a drift it is more.
     """

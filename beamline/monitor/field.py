@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, at_edges, light
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, at_edges, light
 from beamline.monitor.digest import LARGEST, FrameDigest
 from beamline.monitor.view import AIR, BRIGHT, UNLIT, CellGrid, brightest_place
 from drivers.base.frame import Frame, FrameKind
@@ -31,8 +31,9 @@ NAMED = 4  # most shadows that are named
 
 @dataclass(frozen=True)
 class FieldState:
-    """Unlit flats were reported; a view had all matter inside; views in a row with matter at the edges; that was
-    reported."""
+    """Whether unlit flats were reported; whether a view held all matter; consecutive views with matter at the edges;
+    whether these were reported.
+    """
 
     unlit: bool = False
     inside: bool = False
@@ -58,19 +59,21 @@ class FieldOfViewCheck(Logged):
 
     start = FieldState
 
-    def look(self, state: FieldState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[FieldState]:
+    def look(
+        self, state: FieldState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[FieldState]:
         if frame.kind is FrameKind.FLAT and context.dark is not None:
             if state.unlit:
-                return Look(state)
+                return CheckResult(state)
             flag = self._unlit(frame, digest.preview - context.dark)
-            return Look(replace(state, unlit=flag is not None), flag)
+            return CheckResult(replace(state, unlit=flag is not None), flag)
         if context.view is None or context.grid is None or not context.grid.flats or state.reported:
-            return Look(state)
+            return CheckResult(state)
         edges = at_edges(context)
         cut = state.cut + 1 if max(edges) > self.edge else 0
         if cut < LASTS:
-            return Look(replace(state, cut=cut, inside=state.inside or cut == 0))
-        return Look(replace(state, reported=True), self._cut(frame.index, edges, context.grid, state.inside))
+            return CheckResult(replace(state, cut=cut, inside=state.inside or cut == 0))
+        return CheckResult(replace(state, reported=True), self._cut(frame.index, edges, context.grid, state.inside))
 
     def _unlit(self, frame: Frame, light: NDArray[np.float32]) -> Flag | None:
         bright = float(np.percentile(light[::2, ::2], BRIGHT))
@@ -156,33 +159,33 @@ class MassCheck(Logged):
 
     start = MassState
 
-    def look(self, state: MassState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[MassState]:
+    def look(self, state: MassState, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[MassState]:
         view, grid = context.view, context.grid
         if view is None or grid is None or not grid.flats:
-            return Look(state)
+            return CheckResult(state)
         if max(at_edges(context)) > AIR:
-            return Look(replace(state, running=0))
+            return CheckResult(replace(state, running=0))
         lit = float(grid.lit.mean())
         if not lit:
-            return Look(state)
+            return CheckResult(state)
         # A beam that weakens is no sample that enters; matter at an edge is no beam that weakens.
         mass = float(view.depth.mean()) / lit - brightest_place(view, grid)
         if state.usual is None:
-            return Look(_calibrate(state, mass))
+            return CheckResult(_calibrate(state, mass))
         if state.usual < EMPTY:
-            return Look(state)
+            return CheckResult(state)
         score = mass / state.usual - 1
         limit = max(self.warn, SIGMAS * state.scatter)
         if abs(score) <= limit:
-            return Look(replace(state, running=0))
+            return CheckResult(replace(state, running=0))
         state = replace(state, running=state.running + 1)
         if state.running < self.frames:
-            return Look(state)
+            return CheckResult(state)
         advice = (
             f"The sample's total absorption changed by {score:+.1%} for {state.running} views: something "
             f"{'entered' if score > 0 else 'left'} the field, or the sample changes. Look at the latest projection."
         )
-        return Look(state, Flag(self.name, Level.WARN, frame.index, score, limit, advice))
+        return CheckResult(state, Flag(self.name, Level.WARN, frame.index, score, limit, advice))
 
 
 def _calibrate(state: MassState, mass: float) -> MassState:
@@ -234,25 +237,27 @@ class PixelsCheck(Logged):
 
     start = PixelsState
 
-    def look(self, state: PixelsState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[PixelsState]:
+    def look(
+        self, state: PixelsState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[PixelsState]:
         holes = digest.invalid_fraction
         if holes == 1:  # no mask, whatever the frame shows
-            return Look(state, self._without_number(frame.index, holes))
+            return CheckResult(state, self._without_number(frame.index, holes))
         if frame.kind is not FrameKind.PROJECTION:
             state = replace(state, holes=max(state.holes, holes))
         elif holes - state.holes > HOLES:
-            return Look(state, self._without_number(frame.index, holes - state.holes))
+            return CheckResult(state, self._without_number(frame.index, holes - state.holes))
         if state.reported:
-            return Look(state)
+            return CheckResult(state)
         if frame.kind is FrameKind.FLAT:
             dead = _dead(frame, digest, context)
             if state.in_flats and state.dead is not None:
                 dead = np.intersect1d(state.dead, dead, assume_unique=True)
-            return Look(replace(state, dead=dead, in_flats=True))
+            return CheckResult(replace(state, dead=dead, in_flats=True))
         state = replace(state, in_flats=False)
         if frame.kind is not FrameKind.PROJECTION or state.dead is None:
-            return Look(state)
-        return Look(replace(state, reported=True), self._flag(frame, state.dead) if state.dead.size else None)
+            return CheckResult(state)
+        return CheckResult(replace(state, reported=True), self._flag(frame, state.dead) if state.dead.size else None)
 
     def _without_number(self, row: int, score: float) -> Flag:
         advice = (

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.check import AGAIN, Flag, Level, Logged, Look, Policy, ScanContext
+from beamline.monitor.check import AGAIN, CheckResult, Flag, Level, Logged, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest, thinned
 from drivers.base.frame import Frame, FrameKind
 from recon.base.setting import setting
@@ -44,18 +44,18 @@ class SaturationCheck(Logged):
 
     def look(
         self, state: SaturationState, frame: Frame, digest: FrameDigest, context: ScanContext
-    ) -> Look[SaturationState]:
+    ) -> CheckResult[SaturationState]:
         if frame.kind is FrameKind.DARK:
-            return Look(SaturationState(max(state.hot, digest.saturated_fraction)))
+            return CheckResult(SaturationState(max(state.hot, digest.saturated_fraction)))
         score = digest.saturated_fraction - state.hot - context.spots.saturated / context.pixels
         if score <= max(self.warn, FEW_PIXELS / context.pixels):
-            return Look(state)
+            return CheckResult(state)
         level, limit = (Level.ALARM, self.alarm) if score > self.alarm else (Level.WARN, self.warn)
         advice = (
             f"{score:.2%} of the pixels are saturated (>= {context.saturation:g}). Shorten the exposure or add a "
             "filter."
         )
-        return Look(state, Flag(self.name, level, frame.index, score, limit, advice))
+        return CheckResult(state, Flag(self.name, level, frame.index, score, limit, advice))
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,9 @@ class StuckCheck(Logged):
 
     start = StuckState
 
-    def look(self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[StuckState]:
+    def look(
+        self, state: StuckState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[StuckState]:
         """Compare checksums. Without noise, references of one kind are equal, and so are the frames of a view."""
         plain = digest.variance == 0 and frame.kind is not FrameKind.PROJECTION
         alike = digest.checksum == state.checksum
@@ -94,13 +96,13 @@ class StuckCheck(Logged):
             state, checksum=digest.checksum, angle=frame.angle, noiseless=state.noiseless or (plain and alike)
         )
         if not alike or plain or (state.noiseless and as_before):
-            return Look(replace(state, repeats=0))
+            return CheckResult(replace(state, repeats=0))
         state = replace(state, repeats=state.repeats + 1)
         advice = (
             f"Pixel for pixel the frame before, {state.repeats} time{'s' if state.repeats > 1 else ''} in a row: "
             "the camera or its driver repeats a buffer. Stop and restart the camera."
         )
-        return Look(state, Flag(self.name, Level.ALARM, frame.index, state.repeats, 0, advice))
+        return CheckResult(state, Flag(self.name, Level.ALARM, frame.index, state.repeats, 0, advice))
 
 
 @dataclass(frozen=True)
@@ -129,28 +131,30 @@ class TimingCheck(Logged):
 
     start = TimingState
 
-    def look(self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[TimingState]:
+    def look(
+        self, state: TimingState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[TimingState]:
         steps = frame.trigger - state.trigger
         # A view that is repeated alone replaces a frame or fills a gap; the stage stands for it.
         alone = frame.replaces >= 0 or (steps < 1 and any(frame.trigger in gap for gap in state.gaps))
         if frame.kind is not FrameKind.PROJECTION or context.period is None or alone:
-            return Look(state)
+            return CheckResult(state)
         after = TimingState(frame.trigger, frame.framestamp, frame.time, state.gaps)
         lost = steps - 1 - sum(state.trigger < view < frame.trigger for view in context.stored)
         if lost > 0:
             after = replace(after, gaps=(*state.gaps, range(state.trigger + 1, frame.trigger)))
             advice = f"{lost} trigger{'s' if lost > 1 else ''} before this one exposed no frame, or it was lost."
-            return Look(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
+            return CheckResult(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
         if state.trigger < 0 or steps < 1 or 0 <= frame.framestamp <= state.framestamp:
-            return Look(after)  # armed anew, for another pass, or the same one again, or after a pause
+            return CheckResult(after)  # armed anew, for another pass, or the same one again, or after a pause
         score = (frame.time - state.time) / context.period - steps
         if abs(score) <= self.warn:
-            return Look(after)
+            return CheckResult(after)
         advice = (
             f"The frame came {abs(score):.0%} of a period too {'late' if score > 0 else 'early'}: the stage does not "
             "turn evenly, or the trigger line picks up noise."
         )
-        return Look(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
+        return CheckResult(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
 
 
 TRIM = 10  # one preview block in so many is left out at either end: zingers, which say nothing about the camera
@@ -179,20 +183,20 @@ class DarkCheck(Logged):
 
     start = DarkState
 
-    def look(self, state: DarkState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[DarkState]:
+    def look(self, state: DarkState, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[DarkState]:
         if frame.kind is not FrameKind.DARK:
-            return Look(state)
+            return CheckResult(state)
         blocks = thinned(digest.preview)
         if state.blocks is None:
-            return Look(DarkState(blocks))
+            return CheckResult(DarkState(blocks))
         drift = _trimmed_mean(blocks - state.blocks)
         if abs(drift) <= self.drift:
-            return Look(state)
+            return CheckResult(state)
         advice = (
             f"The dark moved by {drift:+.1f} counts since the first dark: check the camera's cooling and for stray "
             "light."
         )
-        return Look(state, Flag(self.name, Level.WARN, frame.index, drift, self.drift, advice))
+        return CheckResult(state, Flag(self.name, Level.WARN, frame.index, drift, self.drift, advice))
 
 
 def _trimmed_mean(values: NDArray[np.float32]) -> float:
@@ -225,14 +229,14 @@ class LostCheck:
 
     start = LostState
 
-    def look(self, state: LostState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[LostState]:
+    def look(self, state: LostState, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[LostState]:
         score = 1 - context.light_left
         if frame.kind is not FrameKind.PROJECTION or score <= self.alarm:
-            return Look(state)
+            return CheckResult(state)
         empty = "Every pixel has one value: the frame was never written, or the camera gave none. Look at the file."
         advice = (
             f"The beam is lost: {score:.0%} of the light is gone. Check ring current, front end and shutter. {AGAIN}"
             if digest.variance
             else empty
         )
-        return Look(state, Flag(self.name, Level.ALARM, frame.index, score, self.alarm, advice))
+        return CheckResult(state, Flag(self.name, Level.ALARM, frame.index, score, self.alarm, advice))

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from beamline.monitor.change import SPAN, FrameScatter, SampleChange
-from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame
 from recon.base.setting import setting
@@ -31,8 +31,9 @@ SPREAD = 2.6  # standard deviation of the estimate for noise alone, over the var
 
 @dataclass(frozen=True)
 class Axis:
-    """One direction: the changes' usual size, the last one, and running means of squares, of products of those that
-    follow one another, and of variances by noise."""
+    """One direction of motion: usual and latest size of changes; running means of their squares, of products of
+    consecutive ones, and of noise variances.
+    """
 
     usual: FrameScatter = field(default_factory=FrameScatter)
     last: float = math.nan
@@ -53,7 +54,7 @@ class Axis:
         return Axis(usual, away, square, product, noise)
 
     def size(self, pairs: int) -> float:
-        """Standard deviation of x in pixels, without the part of the noise; 0 where noise alone may give as much.
+        """Size of the shake: standard deviation in pixels, less the noise; 0 if noise alone may explain it.
 
         The squares tell it more exactly than the products, where these confirm it.
         """
@@ -129,10 +130,12 @@ class MotionCheck(Logged):
 
     start = MotionState
 
-    def look(self, state: MotionState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[MotionState]:
+    def look(
+        self, state: MotionState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[MotionState]:
         change = context.change
         if change is None:
-            return Look(state)
+            return CheckResult(state)
         after = MotionState(
             state.across.with_figure(change.across),
             state.down.with_figure(change.down),
@@ -141,26 +144,28 @@ class MotionCheck(Logged):
             state.told,
         )
         if not state.across.ready or state.quiet:
-            return Look(after)
+            return CheckResult(after)
         jump = self._jump(state, after, frame.index, change)
         return self._shake(after, frame.index, context) if jump is None else jump
 
-    def _shake(self, state: MotionState, row: int, context: ScanContext) -> Look[MotionState]:
+    def _shake(self, state: MotionState, row: int, context: ScanContext) -> CheckResult[MotionState]:
         assert context.grid is not None
         across, down = context.shake
         size, limit = math.hypot(across, down), max(self.shake, CELLS * context.grid.cell)
         if state.told and size < GONE * limit:
-            return Look(replace(state, told=0.0))
+            return CheckResult(replace(state, told=0.0))
         if size <= max(limit, GROWN * state.told):
-            return Look(state)
+            return CheckResult(state)
         advice = (
             f"The sample shakes: at random, views stand {across:.2f} px across and {down:.2f} px down beside its way "
             "(standard deviations of the last hundred views or fewer). Look for vibration and for runout of the stage. "
             "The views are of use: `beamline recon --calibrate shifts` finds the place of each."
         )
-        return Look(replace(state, told=size), Flag(self.name, Level.WARN, row, size, limit, advice))
+        return CheckResult(replace(state, told=size), Flag(self.name, Level.WARN, row, size, limit, advice))
 
-    def _jump(self, state: MotionState, after: MotionState, row: int, change: SampleChange) -> Look[MotionState] | None:
+    def _jump(
+        self, state: MotionState, after: MotionState, row: int, change: SampleChange
+    ) -> CheckResult[MotionState] | None:
         """A jump or a slip; None where there is none."""
         usual = state.across, state.down, state.turn
         change_of_place = change.across, change.down, change.turn
@@ -193,4 +198,4 @@ class MotionCheck(Logged):
             )
         else:
             return None
-        return Look(replace(after, quiet=SPAN), Flag(self.name, Level.ALARM, row, score, limit, advice))
+        return CheckResult(replace(after, quiet=SPAN), Flag(self.name, Level.ALARM, row, score, limit, advice))

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellGrid, CellView, cell_noise
 from drivers.base.frame import Frame
@@ -99,25 +99,27 @@ class OppositeCheck(Logged):
 
     def look(
         self, state: OppositeState, frame: Frame, digest: FrameDigest, context: ScanContext
-    ) -> Look[OppositeState]:
+    ) -> CheckResult[OppositeState]:
         view, grid = context.view, context.grid
         if view is None or grid is None or state.aside or not math.isfinite(view.angle):
-            return Look(state)
+            return CheckResult(state)
         if context.cone or not grid.flats:
             why = "the beam is a cone, in which they differ" if context.cone else "there are no flats"
             advice = f"Views from opposite sides are not compared: {why}."
-            return Look(replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice))
+            return CheckResult(
+                replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice)
+            )
         kept = _with_view(state.kept, view, frame.replaces, follows=context.follows)
         state = replace(state, kept=kept)
         for at, one in enumerate(kept):
             late = one.after is not None and view.index - one.view.index >= LATER
             if late and (looked := self._compared(state, at, view, context)) is not None:
                 return looked
-        return Look(replace(state, kept=tuple(_with_nearer(one, view) for one in kept)))
+        return CheckResult(replace(state, kept=tuple(_with_nearer(one, view) for one in kept)))
 
     def _compared(
         self, state: OppositeState, at: int, view: CellView, context: ScanContext
-    ) -> Look[OppositeState] | None:
+    ) -> CheckResult[OppositeState] | None:
         """The view against one that was kept; None where they are neither opposite nor at one angle, or where the step
         that gives its velocity is far and only a larger motion would show: the pair waits for views that are nearer."""
         one, grid = state.kept[at], context.grid
@@ -136,7 +138,7 @@ class OppositeCheck(Logged):
         looked = (
             self._mirrored(state, one, fit, view, context)
             if mirrored
-            else Look(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", context))
+            else CheckResult(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", context))
         )
         if unsure and looked.flag is None:
             return None
@@ -144,7 +146,7 @@ class OppositeCheck(Logged):
         return replace(looked, state=replace(looked.state, kept=(*state.kept[:at], one, *state.kept[at + 1 :])))
 
     def _unsure(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
-        """By how many pixels the extrapolation of a kept view by so many steps may err, see `Fit.unsure`.
+        """Largest likely error, px, of a kept view extrapolated by some steps, see `Fit.unsure`.
 
         A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
         differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that
@@ -166,7 +168,7 @@ class OppositeCheck(Logged):
 
     def _mirrored(
         self, state: OppositeState, one: Kept, fit: Fit, view: CellView, context: ScanContext
-    ) -> Look[OppositeState]:
+    ) -> CheckResult[OppositeState]:
         assert context.grid is not None
         cell, cols = context.grid.cell, context.grid.shape[1]
         axis = (cols * cell - 1 + fit.across) / 2
@@ -179,12 +181,13 @@ class OppositeCheck(Logged):
         shaken = SHAKEN * math.sqrt(fit.places) * context.shake[0] / 2
         limit = max(self.axis, CELLS[2] * cell, shaken)
         if fit.unsure or flag is not None or not first or stated is None or abs(axis - stated) <= limit:
-            return Look(state, flag)
+            return CheckResult(state, flag)
         advice = (
             f"By frames {one.view.index} and {view.index}, from opposite sides, the axis is at column "
-            f"{axis:.1f}; the scan states {stated:.1f}. The axis is elsewhere, or the sample moved by twice as much."
+            f"{axis:.1f}; the scan states {stated:.1f}. The stated axis is wrong, or the sample moved by twice the "
+            "difference."
         )
-        return Look(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
+        return CheckResult(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
 
     def _moved(self, fit: Fit, row: int, other: str, context: ScanContext) -> Flag | None:
         assert context.grid is not None
@@ -210,7 +213,7 @@ class OppositeCheck(Logged):
 
 
 def _with_view(kept: tuple[Kept, ...], view: CellView, replaces: int, *, follows: bool) -> tuple[Kept, ...]:
-    """The views kept after the next one, which gives the last of them its velocity, or is kept itself."""
+    """The kept views after one more view, which gives the last of them its velocity, or is kept itself."""
     kept = tuple(one for one in kept if one.view.index != replaces)  # the replaced view had an alarm
     if kept and kept[-1].after is None:
         return (*kept[:-1], replace(kept[-1], after=view)) if follows else kept[:-1]

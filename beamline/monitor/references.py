@@ -30,8 +30,8 @@ from beamline.monitor.evidence import (
 from beamline.monitor.sample_in_flats import (
     flats_below_views,
     flats_like_views,
+    sample_in_all_flats,
     views_brighter,
-    views_lack_mass,
     views_show_nothing,
 )
 from drivers.base.frame import FrameKind
@@ -289,7 +289,7 @@ RULES: tuple[tuple[str, FrameKind, Rule], ...] = (
     ("sample_in", FLAT, flats_like_views(single=True)),
     ("sample_in", FLAT, flats_below_views),
     ("sample_in", FLAT, flats_like_views(single=False)),
-    ("sample_in", FLAT, views_lack_mass),
+    ("sample_in", FLAT, sample_in_all_flats),
     ("views_alike", FLAT, views_show_nothing),
     ("views_brighter", FLAT, views_brighter),
 )

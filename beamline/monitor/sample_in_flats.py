@@ -28,7 +28,7 @@ OF_SHALLOW = 1.2816  # standard deviations: SHALLOW percent of noise are further
 
 
 def flats_like_views(single: bool) -> Callable[[Evidence, Any], Iterator[BadFrames]]:
-    """The rule that flats differ less from a view than from other flats: each from those of its group, or groups."""
+    """Rule: flats that resemble a view more than other flats, each within its group, or by whole groups."""
     return partial(_like_views, single=single)
 
 
@@ -137,7 +137,7 @@ def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
             ))  # fmt: skip
 
 
-def views_lack_mass(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
+def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     """All flats show the sample, even at an angle of no view or displaced.
 
     A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are

@@ -173,7 +173,7 @@ def dimmer_than_flats(view: CellView, grid: CellGrid, before: float) -> float:
 
 
 def sums_of_places(image: CellValues, down: int, across: int) -> CellValues:
-    """Sums over a grid of so many places."""
+    """Sums over a grid of `down` x `across` places."""
     rows, cols = (np.arange(parts) * n // parts for parts, n in zip((down, across), image.shape, strict=True))
     return np.add.reduceat(np.add.reduceat(image, rows, axis=0), cols, axis=1)
 

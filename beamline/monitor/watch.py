@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.change import MOST_STEPS, SPAN, change_of, running_mean
-from beamline.monitor.check import Check, Flag, Level, Look, ScanContext, at_edges, more_light
+from beamline.monitor.check import Check, CheckResult, Flag, Level, ScanContext, at_edges, more_light
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import FrameDigest, block_side
 from beamline.monitor.field import PixelsCheck
@@ -108,7 +108,7 @@ def look(
         begin: is called with the name of each check before it looks.
 
     Raises:
-        CheckError: a check raised, whatever it was, or returned what is no `Look`. The monitor that came in is as it
+        CheckError: a check raised, whatever it was, or returned no `CheckResult`. The monitor that came in is as it
             was: go on `without` that check.
     """
     if blank := digest.invalid_fraction == 1:  # only the check of pixels has something to say
@@ -116,10 +116,10 @@ def look(
     else:
         digest = _without_holes(digest)
         monitor = _with_view(monitor, frame, digest)
-    looks: list[Look[Any]] = []
+    looks: list[CheckResult[Any]] = []
     for check, state in zip(monitor.checks, monitor.states, strict=True):
         if blank and not isinstance(check, PixelsCheck):
-            looks.append(Look(state))
+            looks.append(CheckResult(state))
             continue
         begin(check.name)
         try:
@@ -159,10 +159,10 @@ def _without_holes(digest: FrameDigest) -> FrameDigest:
     return replace(digest, preview=preview, peaks=peaks)
 
 
-def _valid(answer: Any, name: str, at: int) -> Look[Any]:
-    """What the check of this name returned at a frame. TypeError, ValueError: a scan cannot go on with it."""
-    if not isinstance(answer, Look) or type(answer.flag) not in (Flag, type(None)):
-        raise TypeError(f"it returned {answer!r:.80}; expected a Look with a Flag or None")
+def _valid(answer: Any, name: str, at: int) -> CheckResult[Any]:
+    """The result of a check, once it is known to be usable. Raises TypeError or ValueError for any other."""
+    if not isinstance(answer, CheckResult) or type(answer.flag) not in (Flag, type(None)):
+        raise TypeError(f"it returned {answer!r:.80}; expected a CheckResult with a Flag or None")
     if (flag := answer.flag) is None:
         return answer
     rows, boxes = (flag.frame if flag.first is None else flag.first, flag.frame), (flag.region, flag.from_region)

@@ -84,7 +84,7 @@ class EventLog:
         self.skipped = 0
 
     def refresh(self) -> None:
-        """Read new lines, of so many bytes at most."""
+        """Read new lines, up to a limit of bytes."""
         if self._folder is None or self._at > LARGEST_LOG:
             return
         with suppress(OSError), open_below(self._folder, EVENTS) as file:

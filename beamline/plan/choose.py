@@ -121,8 +121,9 @@ def remaining_gain(passes: Passes, law: ErrorLaw) -> Gain:
 def next_is_sure(
     passes: Passes, offered: Sequence[PassOption], wish: Wish, law: ErrorLaw, seconds: float, dose: float
 ) -> bool:
-    """Whether the law of an earlier pass suffices: by it the next pass is chosen, and after that pass the plan surely
-    still has more to gain than the wish accepts to lose."""
+    """Whether the law of an earlier pass already decides: it chooses the next pass, and after that pass the plan surely
+    still has more to gain than the wish accepts to lose.
+    """
     choice, _ = choose(offered, wish, remaining_gain(passes, law), seconds, dose)
     later = remaining_gain(passes.after(Choice.NEXT), law)
     return choice is Choice.NEXT and (wish.quality_db is None or later.low > wish.quality_db)

@@ -166,7 +166,7 @@ def violations(facts: PlanFacts) -> Iterator[str]:
         )
     for name, field in (("flats", plan.flats), ("darks", plan.darks)):
         if field.at is not Place.NONE and field.count == 0:
-            yield f"no {name}: scan.{name}.count is 0; take at least one, or say at: none where that is meant"
+            yield f"no {name}: scan.{name}.count is 0; take at least one, or set at: none if that is meant"
     if plan.pass_views and plan.n_views > MOST_PASSES * plan.pass_views:
         yield (
             f"scan.pass_views {plan.pass_views} divides {plan.n_views} views into more than {MOST_PASSES} passes; "

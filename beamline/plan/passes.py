@@ -86,7 +86,7 @@ def triggers_to_take(*blocks: Block) -> frozenset[int]:
 
 
 def passes_at_start(views: Block, size: int, choices: Iterable[str], wide: Iterable[Block] = ()) -> Passes:
-    """A scan at the end of the pass that it begins with, or, after these choices, of the one that it goes on with.
+    """The passes of a scan at the end of its first one, or, after these choices, of the one that it resumes.
 
     Its passes are those of the whole plan, also where earlier files have some of their views.
 
@@ -100,7 +100,7 @@ def passes_at_start(views: Block, size: int, choices: Iterable[str], wide: Itera
 
 
 def pass_blocks(views: Block, size: int) -> tuple[Block, ...]:
-    """The passes of a block of views: its trains, or, of a step scan, so many frames each (0: all).
+    """The passes of a block of views: one for each train, or `size` frames each in a step scan (0: all).
 
     Each is the whole block with the views of other passes marked as stored; a pass without a view to take is left out.
     """

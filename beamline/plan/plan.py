@@ -301,7 +301,7 @@ class Retake:
 
 
 def spread_retakes(views: Sequence[Retake], most: int) -> tuple[Retake, ...]:
-    """At most so many of the views, evenly spread, so that gaps between them stay small."""
+    """A limited number of the views, evenly spread, so that gaps between them stay small."""
     return tuple(views[i] for i in spread(np.arange(len(views)), most))
 
 

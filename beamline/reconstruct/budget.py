@@ -18,7 +18,7 @@ _TIMED_VOXELS = 2**17  # of the part that is timed: what it takes counts
 def in_budget(
     method: Method, budget: float, geometry: Geometry, grid: Grid, now: Clock, warn: Warn
 ) -> tuple[Method, str]:
-    """The choice without the methods that would end too late, or the only method left; and in words who stays, and why.
+    """The choice restricted to methods that end in time, or to the quickest; and in words which stay, and why.
 
     A few iterations of each are timed, then forecasts are compared with the seconds that are left. Nothing else
     changes: the methods that are left run as without a budget, to their own end.

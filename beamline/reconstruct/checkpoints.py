@@ -49,7 +49,7 @@ def differences(now: Mapping[str, Value], before: Mapping[str, Value]) -> list[s
     for name in dict.fromkeys([*now, *before]):
         current, stored = now.get(name), before.get(name)
         if current is None or stored is None:
-            out.append(f"{name} is known of one of them only")
+            out.append(f"only one of the two states {name}")
         elif not np.array_equal(np.asarray(current), np.asarray(stored)):
             out.append(f"{name.removeprefix('setting ')} {_difference(current, stored)}")
     return out

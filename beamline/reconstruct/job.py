@@ -23,7 +23,7 @@ from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import RegionOfRows
-from beamline.reconstruct.run import deviation_by_slabs, deviation_of, made_by, run_on, without_outside
+from beamline.reconstruct.run import candidate_named, deviation_by_slabs, deviation_of, run_on, without_outside
 from beamline.reconstruct.scan_facts import ScanFacts
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
 from drivers.base.clock import Clock
@@ -41,7 +41,7 @@ from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
 from recon.splatting.fit_method import Fit
-from recon.splatting.in_time import LastRound
+from recon.splatting.time_limit import FinalFit
 from recon.voxels.projector import measured_share
 from recon.warm_up import warm_up
 
@@ -118,7 +118,7 @@ class Job:
         stopping: opens what ends the work with the volume so far.
         stop: asks for that; of an open scope.
         slabs: in which the volume is made; none: at once.
-        last_round: ends a fit that has grown with the views; None: the options' method makes the volume.
+        final_fit: ends a fit that has grown with the views; None: the options' method makes the volume.
         leaves: whether there is time for so many seconds before the report.
     """
 
@@ -130,7 +130,7 @@ class Job:
     stop: Stop = field(default_factory=Stop)
     slabs: Sequence[Slab] = ()
     region: RegionOfRows | None = None
-    last_round: LastRound | None = None
+    final_fit: FinalFit | None = None
     leaves: Callable[[float], bool] = lambda seconds: True
 
     @property
@@ -142,7 +142,7 @@ class Job:
     @property
     def method(self) -> Method:
         """The method that reconstructs the volume from these views."""
-        return self.last_round or self.options.method_for(self.prepared.geometry)
+        return self.final_fit or self.options.method_for(self.prepared.geometry)
 
     def say(self, text: str, state: str = "slab") -> None:
         """Report progress of a slab, or another state."""
@@ -231,7 +231,7 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
         job.channels.warn("There are no error bars, because the reconstruction was stopped.")
         return made
     job.say("The volume is there; its error bars follow. Ctrl-C leaves them out.", "error_bars")
-    method = made_by(job.options.method_for(job.prepared.geometry), made.method)
+    method = candidate_named(job.options.method_for(job.prepared.geometry), made.method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
     given = made.volume, method, job.prepared, job.options
 
@@ -258,7 +258,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
     origin, resume, steps = {}, None, 0
     if checkpoints.wanted:
         assert isinstance(method, Fit)  # other methods were refused
-        settings, others = method.made_by
+        settings, others = method.provenance
         origin, steps = origin_of(prepared, settings, {"seed": options.seed, **others}), method.planned_steps or 0
         resume = checkpoints.begin(origin, steps, job.channels.warn)
     lost = ""  # why the last checkpoint was left out
@@ -285,7 +285,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
 
 
 def _of_preset(job: Job, result: Reconstruction) -> str:
-    """The lengths that a preset chose; without one, a warning where a fit could not have the number asked for."""
+    """Steps and Gaussians that a preset chose; without one, a warning if a fit could not have the number asked for."""
     method, started_from = job.method, result.started_from
     if not isinstance(method, Fit):
         return ""

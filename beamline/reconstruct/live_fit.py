@@ -39,8 +39,8 @@ from beamline.storage.readers.base import ScanSource
 from drivers.base.clock import Clock
 from recon.base.method import Progress
 from recon.prep.correct import Projections, merge_and_empty
-from recon.splatting.in_time import LastRound
 from recon.splatting.stream import StreamingFit
+from recon.splatting.time_limit import FinalFit
 
 _NONE = np.empty(0, np.int64)
 BATCH_VIEWS = 32  # views corrected before the fit goes on
@@ -331,7 +331,7 @@ class ScanFollower:
         self.correct_again(usable, why, wide)
         return self._prepared(self.axis_col, usable)
 
-    def last_round(self, seconds: float, snapshot_every: float) -> LastRound:
+    def final_fit(self, seconds: float, snapshot_every: float) -> FinalFit:
         """The end of the fit, to be run on the prepared views: one pass over all of them and sweeps, with snapshots."""
         assert self._fit is not None
         last = self._clock.now()
@@ -347,7 +347,7 @@ class ScanFollower:
             f"then sweeps on voxels; {seconds:g} s at most. A stop takes the volume as it is by then"
         )
         self._sink(StateEntered("finishing", message, time=last))
-        return LastRound(self._fit, self._options.streaming, seconds, self._begin, tuple(self._history), look)
+        return FinalFit(self._fit, self._options.streaming, seconds, self._begin, tuple(self._history), look)
 
     def _joined(self) -> Projections:
         """The line integrals of all views taken, in one piece."""
@@ -358,7 +358,7 @@ class ScanFollower:
         return self._cursor.batches[0]
 
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
-        """All views, now that they are there, after the steps that need all of them."""
+        """All views, once recorded, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
         selection, projections = self._options.selection, self._joined()
         places = ViewGeometry(self.source, selection, axis_col)

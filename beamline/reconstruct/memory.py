@@ -89,7 +89,7 @@ class ReconMemory:
         return (self.raw + _COPIES * self.line_integrals) // self.geometry.n_views
 
     def slab(self, height: int) -> int:
-        """Memory of a slab of so many slices, with its views and weights; figures of merit need less."""
+        """Memory of a slab of `height` slices, with its views and weights; figures of merit need less."""
         halo = self.method.halo
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)

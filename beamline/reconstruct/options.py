@@ -76,7 +76,7 @@ class OutputPaths:
             ) from error
 
     def require_room(self, n_bytes: int, meanwhile: int = 0) -> None:
-        """Raise DataError before any work if the disk has no room for a volume of so many bytes and `meanwhile` bytes
+        """Raise DataError before any work if the disk has no room for a volume of `n_bytes` bytes and `meanwhile` bytes
         of temporary files.
         """
         free = shutil.disk_usage(self.output.parent).free
@@ -153,7 +153,7 @@ class ReconOptions:
         check_settings(self)
 
     def disk_needs(self, volume: int, *, in_slabs: bool) -> tuple[int, int]:
-        """Bytes on disk for the result, and for temporary files, of a volume of so many bytes."""
+        """Bytes on disk for the result, and for temporary files, of a volume of `volume` bytes."""
         if not in_slabs:
             return volume * self.target.written * (1 + self.uncertainty), 0
         compared = self.target.report is not None and self.method.fitted
@@ -191,7 +191,7 @@ class ReconOptions:
 
     @property
     def streaming(self) -> Fit:
-        """The method for a scan that is followed while it runs, which `streams` is true of."""
+        """The method for a scan that is followed while it runs; `streams` must hold."""
         assert isinstance(self.method, Fit)
         return self.method
 

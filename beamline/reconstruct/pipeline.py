@@ -53,7 +53,7 @@ _HELD_OUT_ONE_IN = 10  # one of so many views is held out for --early-stop
 
 @contextmanager
 def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
-    """The job of a scan that is followed while it runs, after its last view: its model has been fitted to all views.
+    """Follow a running scan to its last view, with a fit that grows; yields the job that makes its volume.
 
     Intermediate volumes stand in `<output>.snapshot.h5`, their pictures in `<output>.live.png`; where the block fails
     the newest ones stay, else the picture.
@@ -86,9 +86,9 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 
         phases = Phases(sink, clock)  # waiting for views does not count as work
         phases.enter("last round")
-        last_round = follower.last_round(options.streaming.seconds or MOST_SECONDS, timing.snapshot)
+        final_fit = follower.final_fit(options.streaming.seconds or MOST_SECONDS, timing.snapshot)
         channels = replace(channels, phases=phases)
-        yield Job(options, channels, prepared, facts, lambda: nullcontext(should_stop), last_round=last_round)
+        yield Job(options, channels, prepared, facts, lambda: nullcontext(should_stop), final_fit=final_fit)
     follower.snapshots.remove()
 
 
@@ -211,7 +211,7 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
 def _for_method(
     options: ReconOptions, prepared: PreparedProjections, plan: ReconPlan, channels: Channels
 ) -> PreparedProjections:
-    """The views as the method takes them, with some held out where it ends early, after their disk was looked at.
+    """The views as the method takes them, some held out if it may end early, once the disk has been checked.
 
     Raises:
         ConfigError, DataError: the views do not suffice, or the disk does not.

@@ -88,7 +88,7 @@ class RegionOfRows:
 
 
 def selection_around(source: ScanSource, selection: Selection, region: Region, halo: int) -> Selection:
-    """The selection with only the rows that show the region and a margin of so many slices; the axis is that of all
+    """The selection with only the rows that show the region and a margin of `halo` slices; the axis is that of all
     rows.
 
     Raises:
@@ -143,7 +143,7 @@ def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOf
 
 
 def _refuse_beyond(region: Region, width: int, whose: str) -> None:
-    """Raises ConfigError for voxels beyond a volume so many voxels wide."""
+    """Raise ConfigError for voxels beyond a volume that is `width` voxels wide."""
     for name, (first, end) in (("y", region.y), ("x", region.x)):
         if end > width:
             raise ConfigError(f"--roi {region}: {name} {first}:{end} does not lie in {whose} 0:{width}.")
@@ -229,7 +229,7 @@ def _uncut(height: int, across: int, why: str) -> Region:
 
 
 def _least(data: F32) -> float:
-    """Line integral, of means of nine pixels, that rises from those of air at the edges."""
+    """Line integral above which a mean of nine pixels is matter, from those of the air at the edges."""
     cols = max(2, round(_EDGE * data.shape[2]))
     edges = np.stack([data[..., :cols], data[..., -cols:]])
     air = np.median(edges)

@@ -69,8 +69,9 @@ def _weights(method: Method, prepared: PreparedProjections, held_out: int = 0) -
 
 
 def without_outside(prepared: PreparedProjections, made: Reconstruction) -> PreparedProjections:
-    """Subtract, in place, what the sample outside the volume adds to the views; the volume, and FBP beside it, are
-    judged by the rest. Where nothing is known to lie outside they stay."""
+    """Subtract from the views, in place, what the sample outside the volume adds, so that the volume, and FBP beside
+    it, are judged by the rest; views stay if nothing is known to lie outside.
+    """
     if made.outside is None:
         return prepared
     for first in range(0, prepared.geometry.n_views, _AT_ONCE):
@@ -162,8 +163,8 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
         )
 
 
-def made_by(method: Method, name: str) -> Method:
-    """The method itself or, if it chose among candidates, the one of this name."""
+def candidate_named(method: Method, name: str) -> Method:
+    """The candidate of this name among which the method chose; the method itself if it chose among none."""
     return {candidate.name: candidate for candidate in method.alternatives}.get(name, method)
 
 

@@ -126,7 +126,7 @@ def _frame(source: ScanSource, flags: FrameFlags, row: int) -> FlaggedFrame:
 
 
 def _small(image: NDArray[np.generic]) -> NDArray[np.float32]:
-    """Binned until there are few; rows and columns that do not fill a bin go."""
+    """Pixels binned until there are few; rows and columns that do not fill a bin are dropped."""
     factor = max(1, min(image.shape[1] // PIXELS, *image.shape))
     return np.asarray(bin_views(np.nan_to_num(image.astype(np.float32))[None], factor)[0])
 

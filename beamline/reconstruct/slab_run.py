@@ -130,7 +130,7 @@ class _SlabJob:
         return partial
 
     def begun(self, numbers: Sequence[int]) -> tuple[PartialVolume, list[int]]:
-        """A new partial volume with the first of these slabs that shows anything, and the slabs after it.
+        """Reconstruct slabs until one shows matter; return the new partial volume and the remaining slabs.
 
         Raises:
             DataError: none does.
@@ -173,12 +173,12 @@ class _SlabJob:
             # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
             if first or not method.needs_matter:
                 raise
-            remark = f"Slices {slab.own.start} to {slab.own.stop - 1} are by fista-tv: {error}"
+            remark = f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed by fista-tv instead: {error}"
             return by(FistaTv(), part, box, control), remark
 
 
 def _as_they_come(make: Callable[[int], T], numbers: Sequence[int], at_a_time: int) -> Iterator[tuple[int, T]]:
-    """The slabs of these numbers and what `make` returns of each; `at_a_time` are made or wait to be taken."""
+    """Yield each slab with the result of `make`; at most `at_a_time` are being made or wait to be taken."""
     pool, ahead, under_way = ThreadPoolExecutor(at_a_time), list(numbers), dict[Future[T], int]()
     try:
         while ahead or under_way:

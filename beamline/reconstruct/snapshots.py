@@ -53,7 +53,7 @@ class Snapshots:
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
         """Write the current volume and its picture, replacing the last ones."""
-        shown = fit.shown()
+        shown = fit.best_preview()
         (method, errors), unseen = self._method(shown), self._unseen
         record = ReconRecord(
             volume=shown.volume,
@@ -177,7 +177,7 @@ class LiveSlices:
 
 
 def _coverage(unseen: Wedge | None, angles: NDArray[np.float64]) -> str:
-    """What a heading says where the views leave a wedge out."""
+    """The addition to a heading if the views leave a wedge out."""
     if unseen is None:
         return ""
     order = "sequential: " if one_way(angles) else ""

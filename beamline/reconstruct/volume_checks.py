@@ -228,7 +228,7 @@ def _fbp(made: Reconstruction, prepared: PreparedProjections, target: OutputPath
 def _beside_each_other(
     made: Reconstruction, volumes: Mapping[str, Volume], judgement: Judgement, truth: Volume | None, seed: int
 ) -> dict[str, dict[str, float]]:
-    """Figures of each volume that follow from others: SNR and CNR in regions of one reference, level of air.
+    """Figures of merit that compare volumes: SNR and CNR in regions of one reference, level of air.
 
     The reference is the truth, else FBP of the views, else none. Air, if the views show any, is relative to the noise
     of FBP there.

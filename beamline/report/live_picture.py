@@ -64,7 +64,7 @@ def live_picture(rows: Sequence[PictureRow]) -> bytes:
 
 @cache
 def _font(size: int, bold: bool = False) -> FreeTypeFont:
-    """A font with arrows, of so many pixels."""
+    """A font with arrows, `size` pixels high."""
     import matplotlib
     from PIL import ImageFont
 
@@ -148,7 +148,7 @@ class _Panel:
     unseen: Wedge | None = None
 
     def draw(self, picture: Image, left: int, top: int) -> None:
-        """Draw it so many pixels from the left and the top of the picture, which is where its text begins."""
+        """Draw it at an offset in pixels from the left and the top of the picture, where its text begins."""
         from PIL import Image, ImageDraw
 
         draw = ImageDraw.Draw(picture)

@@ -142,7 +142,7 @@ def reference_sheet(images: Mapping[str, NDArray[np.float32]], shape: tuple[int,
 
 
 def _show(axes: Axes, image: NDArray[np.float32], window: GreyWindow, shape: tuple[int, int]) -> AxesImage:
-    """Draw an image of the whole detector of so many rows and columns, in its pixels."""
+    """Draw an image of the whole detector, whose rows and columns `shape` gives, in its pixels."""
     rows, cols = shape
     edges = -0.5, cols - 0.5, rows - 0.5, -0.5
     return show_image(axes, image, window, edges, stretched=rows < 0.15 * cols)

@@ -110,7 +110,7 @@ class FrameProgress:
         self.total += n
 
     def expect_fewer(self, done: int, n: int) -> None:
-        """The next `n` of the frames planned after `done` do not come."""
+        """Count `n` frames fewer: those planned next after `done` will not come."""
         left = min(done + n, self.total)
         self._ahead = np.append(self._ahead[:done] - self._ahead[done] + self._ahead[left], self._ahead[left:])
         self.total -= left - done

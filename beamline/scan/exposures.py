@@ -275,7 +275,7 @@ class Exposures:
             self._clock.sleep(POLL)
 
     def _rest(self, seconds: float, owed: bool) -> bool:
-        """Let so many s pass; False where a stop cut them short, which it does not in a block that is owed."""
+        """Wait for some seconds; False if a stop cut the wait short, which it does not in a block that is owed."""
         deadline = self._clock.now() + seconds
         while seconds > SLICE:
             self._stop.refuse_abort()

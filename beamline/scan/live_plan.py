@@ -74,7 +74,7 @@ def better_order(plan: ScanPlan) -> tuple[str, ...]:
 
 
 def live_bytes(shape: tuple[int, int], n_views: int, binning: int = 1) -> int:
-    """Estimated memory in bytes of a live volume of so many views, rows and columns."""
+    """Estimated memory in bytes of a live volume of `n_views` views of this shape."""
     rows, cols = (max(1, n // binning) for n in shape)
     return rows * cols * (_A_VOXEL * cols + _A_RAY * n_views)
 

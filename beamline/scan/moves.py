@@ -95,7 +95,7 @@ def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[],
 
 
 def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> dict[str, Callable[[], str]]:
-    """What stands in the beam for this kind of frame, by name, with what says whether it still does."""
+    """Tests of whether each device stays where this kind of frame needs it, by its name."""
     shutter, remembered = devices.shutter, dict[str, Callable[[], str]]()
     if not shutter.by_hand:
         # A scan that is stopped in a pause ends with a closed one.
@@ -107,7 +107,7 @@ def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> d
 
 
 def require_in_place(looks: dict[str, Callable[[], str]], kind: FrameKind, rows: range, stop: StopRequest) -> None:
-    """InstrumentError if a device that was moved and then believed is no longer where it stood before a block."""
+    """Raise InstrumentError if a device has left the place that it had before a block."""
     moved = {name: problem for name, look in looks.items() if (problem := look())}
     if moved and rows and not stop.aborting:
         raise InstrumentError(

@@ -189,7 +189,7 @@ def _began(run: Path) -> float:
 
 
 def _numbered(run: Path) -> tuple[int, str]:
-    """The number that tells runs of one second and sample apart, then the name."""
+    """Sort key of runs: the number that distinguishes runs of the same second and sample, then the name."""
     number = run.name.rpartition("-")[2]
     return (int(number) if number.isdecimal() and "_" in run.name.rpartition("-")[0] else 1), run.name
 

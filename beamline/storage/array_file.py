@@ -40,7 +40,7 @@ _MOST = 1000  # arrays and groups of a Zarr that are looked at
 
 
 class NamedArray:
-    """An array with what is asked of a dataset of HDF5: name, file, attrs, shape, dtype, chunks; values by slices."""
+    """An array with the interface of an HDF5 dataset: name, file, attrs, shape, dtype, chunks; values by slices."""
 
     is_virtual = False
 

@@ -79,7 +79,7 @@ def text_of(item: h5py.Dataset) -> str:
 
 
 def arrays_in(file: h5py.File, dimensions: Sequence[int]) -> Iterator[h5py.Dataset]:
-    """Each dataset of numbers with so many dimensions, once, also behind links."""
+    """Each dataset of numbers with this number of dimensions, once, also behind links."""
     seen, groups = set(), [(file["/"], 0)]
     while groups:
         group, depth = groups.pop()
@@ -165,8 +165,8 @@ def piece_of(item: h5py.Dataset) -> int:
 
 
 def bytes_unpacked(item: h5py.Dataset, frames: int | None = 0) -> int:
-    """Bytes that HDF5 decompresses for one frame of a dataset of three dimensions; `frames` is the number of the frame
-    dimension (or of another one, of whose places one is read; None: of none).
+    """Bytes that HDF5 decompresses to read one place of dimension `frames` of a three-dimensional dataset, or all of it
+    (None).
     """
     across = item.chunks or [n if axis != frames else 1 for axis, n in enumerate(item.shape)]
     pieces = [1 if axis == frames else -(-n // m) for axis, (n, m) in enumerate(zip(item.shape, across, strict=True))]
@@ -202,8 +202,8 @@ def refuse_broken(group: h5py.Group, path: str) -> None:
 
 
 def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | None:
-    """The dataset at a path, read as the values of its numbers where these are packed; None if it is missing or has a
-    null dataspace.
+    """The dataset at a path, unpacked on reading if its numbers are packed; None if it is missing or has a null
+    dataspace.
 
     Of frames in pieces that hold parts of several, it keeps the unpacked pieces of a frame, or where these are too many
     those of a row of all frames, until the next ones are read. `frames` is the number of the frame dimension.
@@ -227,7 +227,7 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
 
 
 def scalar(group: h5py.Group, path: str, units: Mapping[str, float]) -> float | None:
-    """The number in the unit of this program, of a list the median of what is above 0, or else of all; None as
+    """The number in the unit of this program; of a list the median of the positive ones, or else of all. None as of
     `in_units`, and if none is finite.
     """
     values = in_units(dataset(group, path), units)
@@ -247,8 +247,7 @@ def in_units(item: h5py.Dataset | None, units: Mapping[str, float]) -> NDArray[n
 
 
 def _numbers(item: h5py.Dataset) -> tuple[NDArray[np.float64] | None, set[str]]:
-    """The numbers of a dataset, as a list, None where it is no numbers; and the units that its attribute and its text
-    state."""
+    """The numbers of a dataset as a list (None if it holds none), and the units by its attribute and its text."""
     stated = {attribute(item, "units") or attribute(item, "angle_unit")} - {""}  # the latter of CIL
     if item.dtype.kind in "uif":
         return np.ravel(np.asarray(values_of(item), np.float64)), stated

@@ -67,7 +67,7 @@ class UnderHdf5:
         self._file.close()
 
     def _read(self, at: int, out: memoryview) -> None:
-        """Fill `out` with what is there from `at` on."""
+        """Read into `out` from byte offset `at`."""
         self._from_disk(at, out)
 
     def _from_disk(self, at: int, out: memoryview) -> None:
@@ -176,8 +176,8 @@ def scratch_array(folder: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def reserve(descriptor: int, wanted: int, folder: Path) -> None:
-    """Allocate so many bytes for an open file in the folder, where the system can. Missing space is then found now, not
-    during the work.
+    """Allocate `wanted` bytes for an open file in the folder, where the system can. Missing space is then found now,
+    not during the work.
 
     Raises:
         DataError: the disk has not so much space.

@@ -158,7 +158,8 @@ class FrameFlags:
 
     @classmethod
     def joined(cls, each: Sequence[FrameFlags | None], sizes: Sequence[int] | NDArray[np.int64]) -> FrameFlags | None:
-        """The flags of frames one after another, of so many each; None for those that no monitor looked at.
+        """The flags of several scans, one after another, by the number of frames of each; None for those that no
+        monitor looked at.
 
         The legend is theirs if they have the same, else today's.
         """

@@ -112,7 +112,9 @@ def grows_here(path: Path) -> bool:
 
 
 def _apart(path: Path, head: Superblock | None, follow: bool) -> h5py.File:
-    """The file of this program, or of a writer that died, by a driver that HDF5 shares with no other."""
+    """A file that this program writes, or whose writer died, opened by a driver that shares it with no other handle of
+    HDF5.
+    """
     if head is None or (head.open_for_writing and not head.grows and not abandoned(path)):
         raise (NotReadyError if follow else DataError)(f"{path} is being created by this program. Try again.")
     with readable(path):

@@ -1,4 +1,4 @@
-"""Packed numbers: of a dataset whose attributes say how they are read, as CF (netCDF) and CIL write them."""
+"""Packed numbers: datasets whose attributes say what values the stored numbers stand for, as of CF (netCDF) and CIL."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NAMES = {*_CF, *_CIL, "_FillValue", "missing_value", "valid_range", "valid_min"
 
 
 class PackedDataset(h5py.Dataset):  # type: ignore[misc]  # h5py has no types
-    """A dataset that is read as the values of its numbers; `id.dtype` is the type that is stored."""
+    """A dataset whose numbers are unpacked on reading; `id.dtype` is the stored type."""
 
     def __init__(self, item: h5py.Dataset, values: Callable[[Any], NDArray[Any]]) -> None:
         super().__init__(item.id)
@@ -32,7 +32,7 @@ class PackedDataset(h5py.Dataset):  # type: ignore[misc]  # h5py has no types
 
 
 def unpacked(item: h5py.Dataset) -> h5py.Dataset:
-    """The dataset, read as the values of its numbers where these are packed. DataError as of `packing`."""
+    """The dataset, unpacked on reading if its numbers are packed. Raises DataError as `packing`."""
     if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "uif" or not _NAMES & {*item.attrs}:
         return item  # an array of a Zarr has done so
     by_cil = "cil_version" in item.file.attrs or "NEXUSDataWriter" in str(item.file.attrs.get("creator"))
@@ -43,7 +43,7 @@ def unpacked(item: h5py.Dataset) -> h5py.Dataset:
 def packing(
     attributes: Mapping[str, Any], dtype: np.dtype[Any], where: str, *, by_cil: bool
 ) -> Callable[[Any], NDArray[Any]] | None:
-    """A function that makes values of stored numbers [...], NaN of those that are none; None: they are the values.
+    """A function from stored numbers [...] to values, NaN for those that stand for none; None if they are the values.
 
     Values are of a real type that holds all that is stored: by CF stored * scale_factor + add_offset, by CIL (stored -
     offset) / scale.

@@ -134,7 +134,7 @@ def require_ours(path: Path, file: h5py.File) -> None:
 
 
 def _with_view(path: Path, head: Superblock) -> Recovered:
-    """A closed file; the /exchange view is added where it lacks."""
+    """The closed file, with the /exchange view added if it lacks it."""
     with closing(GrowingFile(path, head)) as disk, h5py.File(disk, "r") as file:
         require_ours(path, file)
         require_joined(file)
@@ -146,7 +146,7 @@ def _with_view(path: Path, head: Superblock) -> Recovered:
 
 
 def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
-    """Copy the frames that are there to a new file; what is known of them."""
+    """Copy the readable frames to a new file; returns what is known of them."""
     try:
         with closing(GrowingFile(path, head)) as disk, h5py.File(disk, "r") as file:
             require_harmless(file)

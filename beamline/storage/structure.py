@@ -78,8 +78,9 @@ def _names(file: h5py.File, path: Path) -> Iterator[str]:
 
 
 def _refuse_claim(dataset: Any, made: Any, what: str) -> None:
-    """DataError for a dataset that claims more than any compression makes of what is stored of it, or whose values are
-    the bytes of another file, which may be any file that the reader can open."""
+    """Raise DataError for a dataset that claims more than any compression could yield of what is stored, or whose
+    values are the bytes of another file, which may be any that the reader can open.
+    """
     if made.get_external_count():
         raise DataError(
             f"{what} has its values in {os.fsdecode(made.get_external(0)[0])}, which is not HDF5 and is not read. Copy "
@@ -118,7 +119,7 @@ _LONGEST, _MOST = 2**31, 2**60  # voxels along a side, and bytes in all: far bey
 
 
 def is_blank(unpacked: int, stored: int, piece: int) -> bool:
-    """Whether so many bytes of images, of which a large piece is unpacked at once, take less than a 500th of them.
+    """Whether images that unpack in large pieces take less than a 500th of their bytes in the file.
 
     Shot noise of one count in a hundred pixels takes 0.08 of their 16 bits, a 200th: what is packed closer than that
     holds no image, and may be made to fill the memory.

@@ -55,7 +55,7 @@ class Superblock:
         return int.from_bytes(self.head[_END], "little")
 
     def closed(self, end: int) -> bytes:
-        """The head of the same file as if it had been closed with so many bytes."""
+        """The head of the same file as if it had been closed with `end` bytes."""
         head = bytearray(self.head)
         head[_FLAGS] = 0
         head[_END] = end.to_bytes(8, "little")

@@ -70,7 +70,7 @@ def description(
 
 
 def _if_told(ask: Callable[[], str], otherwise: str) -> str:
-    """The answer; `otherwise` for a camera that does not give it."""
+    """The camera's answer; `otherwise` if it does not give one."""
     try:
         return ask()
     except DcamError as error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage, StageLimits
@@ -27,6 +27,8 @@ class StageFigures(CheckedSettings):
         ValueError: figures that no stage can have.
     """
 
+    stand_in: ClassVar[str] = ""
+    """The kind of stage that is simulated in the place of this one; "": this one has a simulated controller itself."""
     counts_per_turn: int = setting(doc="Motor pulses or encoder counts for 360 deg; triggers fall on whole ones.", gt=0)
     max_speed: float = setting(unit="deg_s", gt=0)
     acceleration: float = setting(unit="deg_s2", gt=0)
@@ -101,6 +103,8 @@ class Wiring(CheckedSettings):
 
 class StageSettings(Protocol):
     """Settings of a driver, and the limits that follow from them: a dataclass on `StageFigures`."""
+
+    stand_in: ClassVar[str]
 
     @property
     def max_speed(self) -> float: ...

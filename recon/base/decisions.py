@@ -82,7 +82,7 @@ class Stop:
         return type(self)(self, deadline, now)
 
     def leaves(self, seconds: float) -> bool:
-        """Whether at least so many s remain before its own deadline."""
+        """Whether at least `seconds` s remain before its own deadline."""
         return self.deadline == math.inf or self._now() + seconds <= self.deadline
 
     def cut(self, done: int, planned: int) -> bool:

@@ -2,10 +2,10 @@
 
 Those that choose and make a volume of `fista-tv`, `os-sirt-tv`, `pnp-dct`, `r2` and `auto` stand here, by the question
 that they answer. Each says what it is and what is lost without it: dB of `r2` by default on 8 to 24 rows of 50 views,
-where nothing else is said. "By the noise" is FISTA-TV where no views are held out. docs/choosing.md has the table that
-tests/bench/test_thresholds.py makes: it removes most of them again. What brings less than 0.2 dB on bone and cement, on
-which nothing was tuned, and prevents no loss of 1 dB on any row, has no place here, unless it saves time, or could not
-be measured and says so.
+where nothing else is said. "By the noise" is FISTA-TV where no views are held out. tests/bench/test_thresholds.py
+removes most of them and prints what that costs. What brings less than 0.2 dB on bone and cement, on which nothing was
+tuned, and prevents no loss of 1 dB on any row, has no place here, unless it saves time, or could not be measured and
+says so.
 """
 
 from __future__ import annotations

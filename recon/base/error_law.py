@@ -25,7 +25,7 @@ class Gain:
 
     @property
     def at_most(self) -> float:
-        """What to count on before it is forgone: the mean, or the high end where no law is known to half of it."""
+        """The gain to assume before it is given up: the mean, or the high end if the law is unsure by half or more."""
         return self.mean if self.high <= (1 + BELOW) * self.mean * (1 + 1e-9) else self.high
 
 
@@ -48,7 +48,7 @@ class ErrorLaw:
     offset: float = 0.0
 
     def gain(self, views: int = 0, again: int = 0, wide: bool = False) -> Gain:
-        """dB by so many views at new angles, at the same angles again, and by wide views."""
+        """Gain in dB of PSNR by further views: at new angles, at the same angles again, and by wide views."""
 
         def decibels(factor: float) -> float:  # with the exponent and the shares times this factor
             noise = min(factor * self.noise, 1 - self.offset)

@@ -250,7 +250,7 @@ def _first_peak(curve: NDArray[np.float64], height: float, prominence: float) ->
 
 
 def _long_axes(images: F32) -> list[int]:
-    """Axes along which five pixels that count are beside each other, also after differences along the one before."""
+    """Axes along which five valid pixels lie side by side, also after differences along the axes before."""
     field, axes = images, list[int]()
     for axis in (1, 2):
         further = np.diff(field, _HIGH, axis=axis)
@@ -275,7 +275,9 @@ def _differences(images: F32, axes: list[int], order: int) -> float:
 
 @cache
 def _blurs() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ratios of variances along an axis, for Gaussian blurs of rising width: `_HIGH` and all over `_LOW`."""
+    """Variance of differences of order `_HIGH`, and of undifferenced pixels, over that of order `_LOW`, for Gaussian
+    blurs of rising width.
+    """
     widths = np.linspace(0, _LARGEST_BLUR, 301)
     f = (np.arange(4096) + 0.5) / 8192  # cycles a pixel
     passed = np.exp(-((2 * np.pi * widths[:, None] * f) ** 2))

@@ -62,13 +62,13 @@ class Views:
         return Views(np.divide(sums, known, out=np.zeros_like(sums), where=known > 0), views, known)
 
     def split(self, one_in: int = ONE_IN) -> tuple[Views, Views]:
-        """The views to reconstruct from, and one in so many held out, see `split_views`."""
+        """The views to reconstruct from, and one in `one_in` held out, see `split_views`."""
         seen, unseen = split_views(self.geometry, one_in)
         return self.select(seen), self.select(unseen)
 
 
 def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Views to reconstruct from, and one in so many held out, evenly spread in angle."""
+    """Views to reconstruct from, and one in `one_in` held out, evenly spread in angle."""
     order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
     unseen = np.sort(order[one_in // 2 :: one_in])
     return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen

@@ -33,7 +33,7 @@ class ProcessorLevel:
 
     @property
     def environment(self) -> dict[str, str]:
-        """What numba compiles for this level with."""
+        """The settings that make numba compile for this level."""
         return {"NUMBA_CPU_NAME": self.name, "NUMBA_CPU_FEATURES": self.features}
 
 

@@ -67,7 +67,7 @@ def _half_turn(theta: Floats) -> tuple[NDArray[np.intp], Floats]:
 
 
 def _join(data: Floats, total: int, times: Floats) -> tuple[Floats, Floats, Floats]:
-    """Columns [candidate], their mismatch as axes, and errors [join] in columns of joins within the scan.
+    """Candidate columns for the axis, their mismatch, and errors [join] in columns at joins within the scan.
 
     Args:
         data: [view, row, col]; `times` are those of its last and its first views.

@@ -184,7 +184,7 @@ class AirSums:
 
 
 def _around(values: F64, width: int) -> F64:
-    """Sums over so many views around each [view, ...]; at both ends over the first and the last views."""
+    """Sums over `width` views around each [view, ...]; at both ends over the first and the last views."""
     total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, axis=0)))
     first = np.clip(np.arange(len(values)) - width // 2, 0, len(values) - width)
     return np.asarray(total[first + width] - total[first])

@@ -65,7 +65,7 @@ class Overshoot:
 
     @classmethod
     def of_counts(cls, counts: F32, dark: F32 | float, flat: F32 | float) -> Overshoot:
-        """The same of counts [view, row, col], with dark and flat [row, col]; where the flat has no light is air."""
+        """The same for counts [view, row, col], with dark and flat [row, col]; pixels unlit in the flat are air."""
         beam = flat - dark
         light = np.where(beam > 0, (counts - dark) / np.where(beam > 0, beam, 1), 1)
         return cls.of(-np.log(np.maximum(light, 1e-6)).astype(np.float32))

@@ -116,8 +116,8 @@ class SpotFilter:
 
 
 def without_spots(frames: Iterable[NDArray[Any]], light: float) -> Iterator[tuple[NDArray[Any], int]]:
-    """Darks or flats [row, col] as they were taken, of each the number of pixels in spots: there it has the mean of the
-    frames beside it. A single frame stays as it is.
+    """Darks or flats [row, col] without their spots, each filled by the mean of the frames beside it, and the number of
+    pixels filled in each. A single frame stays as it is.
 
     Args:
         light: counts of the open beam.

@@ -85,7 +85,7 @@ def with_rim(dark: Mask, light: F32) -> Mask:
 
 
 def _mixed(lines: F64) -> bool:
-    """Whether the first of pixels side by side [edge, pixel] has not the light that the others lead to; logarithms."""
+    """Whether the first of adjacent pixels [edge, pixel] lacks the light that the others extrapolate to; logarithms."""
     lines = lines[np.isfinite(lines).all(axis=1)]
     if not len(lines):
         return True

@@ -48,7 +48,7 @@ def while_views_come(settings: FitSettings) -> FitSettings:
 
 
 def fallen(steps: int, settings: FitSettings) -> float:
-    """Fraction, 0..1, of the logarithmic decay of the rates that is done after so many steps.
+    """Fraction, 0..1, of the logarithmic decay of the rates that is done after `steps` steps.
 
     Rates that are lower from the start fall as much later.
     """

@@ -47,7 +47,7 @@ class Fit(Iterative):
 
     @property
     @abstractmethod
-    def made_by(self) -> tuple[FitSettings, Mapping[str, Plain]]:
+    def provenance(self) -> tuple[FitSettings, Mapping[str, Plain]]:
         """All settings that determine the steps, which a resumed run must share, and more by name."""
 
     @property

@@ -62,7 +62,7 @@ def count_for(field: Grid, cone: bool) -> int:
 
 
 def joined_for(field: Grid, cone: bool, count: float, detector: tuple[int, int]) -> int:
-    """The factor by which pixels [row, col] are joined for a fit of so many Gaussians.
+    """The factor by which pixels [row, col] are joined for a fit of `count` Gaussians.
 
     Where there are fewer Gaussians than one for 60 voxels, each is wider, by the cube root of the ratio. Those of a
     cone cover surfaces, and are wider by its square root. Pixels as wide show all of them. At least four rows remain.

@@ -117,7 +117,7 @@ class R2(Fit):
         )
 
     @property
-    def made_by(self) -> tuple[FitSettings, Mapping[str, Plain]]:
+    def provenance(self) -> tuple[FitSettings, Mapping[str, Plain]]:
         assert not isinstance(self.gaussians, Gaussians)
         return self.fit, {"start": self.start, "gaussians": self.gaussians or 0}
 

@@ -238,7 +238,7 @@ class FitSettings:
 
 
 def in_steps(settings: FitSettings, steps: float) -> FitSettings:
-    """The settings of a fit of so many steps, where these are more than `paced_for`.
+    """The settings for a fit of `steps` steps: slower rates if these are more than `paced_for`.
 
     Its rates fall with their square root. So does the least weight of total variation, which a short fit needs to be
     smooth.

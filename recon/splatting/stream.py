@@ -329,7 +329,7 @@ class StreamingFit:
             return Volume(np.zeros(grid.shape, np.float32), grid)
         return fit.volume_of(averaged(self._state), grid, self._template, self._settings)
 
-    def shown(self) -> BetterVolume:
+    def best_preview(self) -> BetterVolume:
         """The volume that predicts held-out views better: that of the model, or FBP of the views so far."""
         if self._problem is None or self._state is None:
             return BetterVolume(self.snapshot(), False, PredictionErrors())

@@ -27,11 +27,6 @@ from recon.splatting.checkpoint import HeldOutTracker, arrays_of, state_from
 from recon.splatting.finish import finish
 from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians, turned_by_rows
-from recon.splatting.in_time import (
-    FinishPlan,
-    fill_seconds,
-    planned_finish,
-)
 from recon.splatting.initialise import (
     default_count,
     first_volume,
@@ -43,6 +38,11 @@ from recon.splatting.optimise import FitState
 from recon.splatting.problem import FitProblem, join_pixels
 from recon.splatting.settings import FitSettings, growth, in_steps, tv_size, tv_weight
 from recon.splatting.splat import voxel_means
+from recon.splatting.time_limit import (
+    FinishPlan,
+    fill_seconds,
+    planned_finish,
+)
 from recon.voxels.residuals import residuals_of
 
 _TIMED = 3  # steps after which a fit's seconds are planned
@@ -73,7 +73,9 @@ class _FitViews:
     @classmethod
     def of(cls, method: Fit, problem: ReconProblem) -> _FitViews:
         if problem.geometry.skew and isinstance(method.gaussians, Gaussians):
-            raise ValueError("Gaussians to start from are refused where rows have different angles: give their number")
+            raise ValueError(
+                "a fit whose rows have different angles cannot start from given Gaussians: give their number"
+            )
         if problem.geometry.width and problem.device != "cpu":
             warnings.warn(
                 f"a fit on {problem.device} takes rays without a width: only its finish on voxels knows "
@@ -112,8 +114,9 @@ class _FitViews:
 
 
 def _of_steps(geometry: Geometry, device: str) -> Geometry:
-    """The geometry that steps see: all rows at the angle of the first, since else slices turn against each other, which
-    is a twist of the model; and on a GPU rays without a width."""
+    """The geometry that steps see: all rows at the angle of the first, as slices that turn against each other would
+    twist the model; and on a GPU rays without a width.
+    """
     first = geometry.at_row(0)
     return first if device == "cpu" else first.seen_with(NO_WIDTH)
 
@@ -137,7 +140,7 @@ class _Length:
     planned: bool
 
     def fraction(self, step: int, spent: float) -> float:
-        """Share of the fit that is done after so many steps and seconds, 0..1."""
+        """Share of the fit that is done after `step` steps and `spent` s, 0..1."""
         by_steps = step / self.steps if self.steps else 0.0
         return min(1.0, max(by_steps, spent / self.seconds if self.seconds else 0.0))
 
@@ -291,7 +294,7 @@ def _steps(run: _Run) -> None:
 
 
 def _pace(run: _Run, seconds: float, spent: float, done: int) -> None:
-    """Plan the finish and the rates by the time that the first `done` steps took, for a fit of so many `seconds`."""
+    """Plan the finish and the rates of a fit of `seconds` s, by the time that its first `done` steps took."""
     length, state = run.length, run.state
     remaining, step = seconds - spent, spent / done
     if not length.planned and done == _TIMED:
@@ -325,7 +328,7 @@ def _finished(run: _Run, volume: Volume, model: Gaussians) -> tuple[Volume, int]
 
 
 def _finish_in_time(run: _Run, remaining: float, step: float) -> FinishPlan:
-    """The plan of the finish, if so many seconds remain after first steps of `step` seconds each."""
+    """The plan of the finish, with `remaining` s left after first steps of `step` s each."""
     return planned_finish(run.method, remaining, MOST_STEPS * step, run.views.fitted, run.control.now)
 
 

@@ -310,7 +310,7 @@ def gridding_pays(views: int, cols: int, voxels: tuple[int, int], slices: int, r
 def nanoseconds(
     views: int, cols: int, voxels: tuple[int, int], slices: int, response: Callable[[int], F32]
 ) -> tuple[float, float]:
-    """Times of sixteen slices of so many columns there, ray by ray and by gridding."""
+    """Times of sixteen slices, ray by ray and by gridding, in ns."""
     points = views * _frequencies(max(cols, *voxels), response)[0].size
     blocks = -(-slices // SLICES)
     plane = _cells(voxels[0]) * _cells(voxels[1])

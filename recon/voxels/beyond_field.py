@@ -42,7 +42,7 @@ _LOOKS = 8  # views by which rows are chosen
 _STEP, _FINE, _WIDEST = 1.2, 1.2 ** (1 / 4), 4.5  # ratios of radii: of the first search, of the second; at most
 
 
-def run_in_box_of_sample(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
+def run_on_extended_grid(method: Method, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """Run a method in a box that holds all of the sample, and give back the part on the grid of the problem.
 
     The box is as wide as the sample. Where a sample goes on above or below the field of a cone, it is as tall as the
@@ -183,7 +183,7 @@ def _predicting_radius(views: F32, geometry: Geometry, reach: float) -> SampleRa
 
 
 def _factor(geometry: Geometry, columns: int) -> int:
-    """The binning that leaves at most so many columns."""
+    """The binning that leaves at most `columns` columns."""
     rows, cols = geometry.detector_shape
     return max(1, min(rows, math.ceil(cols / columns)))
 

@@ -30,18 +30,18 @@ MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 
 
 def exceeds_standard_error(gains: F64, errors: float) -> bool:
-    """Whether the mean gain [view held out] exceeds so many of its standard errors."""
+    """Whether the mean gain [view held out] exceeds `errors` of its standard errors."""
     scatter = float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
     return float(gains.mean()) > errors * scatter
 
 
 def predicts_as_well(residuals: F64, best: F64) -> bool:
-    """Whether residuals [view held out] are more than those of the best by chance alone, if at all."""
+    """Whether residuals [view held out] exceed those of the best by no more than chance."""
     return not exceeds_standard_error(residuals - best, _ERRORS)
 
 
 def significantly_better(residuals: F64, other: F64, least_gain: float) -> bool:
-    """Whether residuals [view held out] are less than another candidate's beyond chance, and by so much of them."""
+    """Whether residuals [view held out] are below another candidate's, beyond chance and by the share `least_gain`."""
     by_more = float(residuals.mean()) < (1 - least_gain) * float(other.mean())
     return by_more and exceeds_standard_error(other - residuals, _ERRORS)
 

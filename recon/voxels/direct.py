@@ -273,7 +273,7 @@ Response = tuple[int, tuple[int, int], F32]
 
 @lru_cache(1)  # most detectors are rolled by one angle
 def _response(rows: int, width: int, roll: float, pitch: float, filter: Filter) -> Response:
-    """The ramp across the rotation axis, for views of this roll and so many rows and columns, zeros counted."""
+    """The ramp across the rotation axis, for views of this roll, with `rows` rows and `width` columns with zeros."""
     beyond = math.ceil(width * abs(math.sin(roll)))  # rows that the ramp's line spans: as the last ones
     m, n = fft.next_fast_len(rows + 2 * beyond), fft.next_fast_len(2 * width, real=True)
     along = fft.fftfreq(m)[:, None] if roll else np.zeros((1, 1))

@@ -221,7 +221,7 @@ class _Problem:
         return Grid.matching(self.geometry)
 
     def corrected(self, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, Geometry, F32]:
-        """Some views as they are without these displacements, their geometry, and the weights of their rays."""
+        """Some views corrected for these displacements, their geometry, and the weights of their rays."""
         geometry, parts = self.geometry.select(views), self.parts[views]
         data = self.projections[views]
         known = np.repeat(self.known[None], views.size, 0)
@@ -240,7 +240,7 @@ class _Problem:
         return solve(method, projector, data, weight=weight, watch=Watch(on_trial=lambda: True))
 
     def residual(self, volume: Volume, moves: Sequence[Displacement], views: NDArray[np.integer]) -> tuple[F32, F32]:
-        """Views less those of the volume, without smooth differences, and the weights of their rays."""
+        """Views minus projections of the volume, without smooth differences, and the weights of their rays."""
         data, geometry, weight = self.corrected(moves, views)
         return _without_smooth(data - Projector(geometry, self.grid).forward(volume.data), weight), weight
 

@@ -213,7 +213,7 @@ def columns_of_matter(geometry: Geometry, grid: Grid, images: F32) -> tuple[slic
 
 
 def middle_of_cone(geometry: Geometry, grid: Grid, data: F32, height: int) -> tuple[slice, Geometry, Grid] | None:
-    """The middle rows of a cone, so many, as a geometry, and the box that holds their rays.
+    """The middle `height` rows of a cone as a geometry, and the box that holds their rays.
 
     None: views of a circle are displaced along the rows, or these rows show little of the matter in `data` [view, row,
     col].

@@ -38,7 +38,7 @@ def choice_sweeps(geometry: Geometry) -> float:
 def predicted_views(
     method: Method, data: F32, geometry: Geometry, grid: Grid, known: NDArray[Any] | None, one_in: int
 ) -> tuple[NDArray[np.intp], F32]:
-    """Numbers of the held-out views, one in so many by angle, and their images [view, row, col] predicted by the
+    """Numbers of the held-out views, one in `one_in` by angle, and their images [view, row, col] predicted by the
     others.
 
     Args:

@@ -319,6 +319,6 @@ def lost_matter(volume: F32, reference: F32, seen: NDArray[np.bool_] | None = No
 
 
 def _blocks(volume: F32, factor: int) -> F32:
-    """Means of blocks of so many voxels a side; voxels at the ends that do not fill a block are dropped."""
+    """Means of blocks of `factor` voxels a side; voxels at the ends that do not fill a block are dropped."""
     layers = (volume[z : z + factor].mean(axis=0, dtype=np.float32) for z in range(0, len(volume) - factor + 1, factor))
     return np.concatenate([bin_views(layer[None], factor) for layer in layers])

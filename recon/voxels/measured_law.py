@@ -54,7 +54,8 @@ _CIRCLE = 0.95  # of the field's radius, where errors count
 def measured_law(
     data: F32, geometry: Geometry, views_at_ends: Sequence[int], rng: np.random.Generator, open_beam: F32
 ) -> tuple[ErrorLaw, float | None]:
-    """The law of the error of the volume of these views, and dB by those of the last pass (None: not known).
+    """The law of the error of the volume of these views, and the dB that the views of the last pass gained (None: not
+    known).
 
     Args:
         data: line integrals [view, row, col] in the order taken; finite.
@@ -69,7 +70,7 @@ def measured_law(
     """
     n = len(data)
     if geometry.is_cone:
-        raise ValueError("the beam is a cone, of which no law of the error is measured")
+        raise ValueError("the law of the error is not measured for a cone beam")
     if n < LEAST_VIEWS or len(open_beam) < _LEAST_FRAMES:
         raise ValueError(
             f"{n} views and {len(open_beam)} frames of the open beam are there, "

@@ -56,8 +56,9 @@ def squares_left(model: F32, views: F32, weight: F32 | None, resolution: ViewRes
 
 
 def unseen_residuals(model: F32, views: F32, weight: F32 | None, resolution: ViewResolution) -> F64:
-    """[view] root mean square of what a volume leaves, see `squares_left`; of each view of which a ray counts, [inf]
-    where there is none."""
+    """[view] root mean square of what a volume leaves, see `squares_left`, of views with a measured ray; [inf] if there
+    is none.
+    """
     left, _, rays = squares_left(model, views, weight, resolution)
     return np.sqrt(left[rays > 0] / rays[rays > 0]) if rays.any() else np.full(1, np.inf)
 
@@ -79,7 +80,7 @@ def _summed(left: F32, views: F32, counts: Mask) -> SquaresLeft:
 def left_by_volume(
     volume: Volume, views: Views, most: int, progress: Callable[[int, int], None], *, beside_uniform: bool = False
 ) -> tuple[SquaresLeft, tuple[float, float] | None]:
-    """What a volume leaves of at most so many views, evenly spread.
+    """What a volume leaves of at most `most` views, evenly spread.
 
     Of a detector with more than 2^17 pixels only bands of rows with so many pixels are used.
 

@@ -259,7 +259,7 @@ class Trial:
         return of_all
 
     def best_patches(self, weight: float, first: float, steps: int) -> BestStrength | None:
-        """The strength of so many steps with patches after total variation, searched from `first`; None: as above."""
+        """The strength of `steps` steps with patches after total variation, searched from `first`; None: as above."""
         smooth = self.volume_of_weight(weight) if self.smooth is None else self.smooth
 
         def made(strength: float) -> F32:

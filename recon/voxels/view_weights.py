@@ -121,7 +121,7 @@ def ray_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
 
 
 def column_shares(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
-    """Share [view, 1 + col + 1] of each ray of a full turn in what it and its opposite measure, and zeros beside."""
+    """Weight [view, 1 + col + 1] of each ray of a full turn, shared with its opposite ray, and zeros beside."""
     cols, axis = geometry.detector_shape[1], geometry.axis_col + geometry.shifts[:, 0]
     return _shares(cols, axis, axis[_nearest(geometry.angles, geometry.angles + np.pi)])
 
@@ -238,7 +238,7 @@ def missing_arc(geometry: Geometry) -> float:
 
 
 class Wedge(NamedTuple):
-    """Rays that no view shows: those of views that are missing from the angle `first` on, over `size` (radians)."""
+    """Rays that no view shows: those of missing views, from the angle `first` on over `size` radians."""
 
     first: float
     size: float

@@ -86,5 +86,5 @@ no files; its errors pass through."""
 
 
 def sample_at(sample: Sample, seconds: float) -> Sample:
-    """The sample so many seconds after the camera was connected."""
+    """The sample `seconds` s after the camera was connected."""
     return sample.at(seconds) if isinstance(sample, Changing) else sample

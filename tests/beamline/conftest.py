@@ -1,4 +1,7 @@
-"""Figures are drawn where a test looks at them; elsewhere drawing would take most of a report's time."""
+"""Figures are drawn where a test looks at them; elsewhere drawing would take most of a report's time.
+
+The Zaber's wire is one of the tests: a fixture makes it the simulated controller of its kind.
+"""
 
 import base64
 from typing import IO
@@ -29,3 +32,14 @@ def real_pictures() -> None:
 def _undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if "real_pictures" not in request.fixturenames:
         monkeypatch.setattr("beamline.report.figures.canvas", BlankCanvas)
+
+
+@pytest.fixture
+def simulated_zaber(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of scans with the Zaber's own driver: sim://zaber is a port of it."""
+    from beamline.instrument.simulated import WIRES
+    from drivers.stages.zaber.settings import ZaberSettings
+    from tests.simulators.wires.zaber.wire import ZaberBuild
+
+    monkeypatch.setattr(ZaberSettings, "stand_in", "")
+    monkeypatch.setattr(WIRES, "_entries", {**WIRES, "zaber": ZaberBuild})

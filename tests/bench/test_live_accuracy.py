@@ -18,8 +18,8 @@ from recon.assess.metrics import psnr
 from recon.base.method import Progress, ReconProblem, RunControl
 from recon.base.view_data import Views
 from recon.base.volume import Grid
-from recon.splatting.in_time import LastRound
 from recon.splatting.stream import StreamingFit
+from recon.splatting.time_limit import FinalFit
 from recon.warm_up import warm_up
 from tests.bench.test_anytime_curve import ORDERS, VIEWS, Scan, particles, two_cores
 from tests.clock import SteppedClock
@@ -51,7 +51,7 @@ def _live(scan: Scan, steps: float) -> LiveCurve:
             fit.advance(int(owed))
             owed -= int(owed)
         if view + 1 in LOOKS:
-            found.shown.append(psnr(truth, fit.shown().volume.data))
+            found.shown.append(psnr(truth, fit.best_preview().volume.data))
             found.fit.append(psnr(truth, fit.snapshot().data))
             by_fbp = recon.reconstruct(data[: view + 1], geometry.select(range(view + 1)), recon.Fbp(filter="hann"))
             found.direct.append(psnr(truth, np.maximum(by_fbp.volume.data, 0)))
@@ -65,7 +65,7 @@ def _live(scan: Scan, steps: float) -> LiveCurve:
             found.after.append(psnr(truth, fit.snapshot().data))
             begin += two_cores() - now
 
-    last = LastRound(fit, recon.R2(), 1e9, 0.0, on_progress=look)
+    last = FinalFit(fit, recon.R2(), 1e9, 0.0, on_progress=look)
     made = last.run(ReconProblem(Views(data, geometry), grid), RunControl())
     found.seconds.append(two_cores() - begin)
     found.after.append(psnr(truth, made.volume.data))

@@ -1,7 +1,7 @@
 """What the monitor sees and what it does not; run with  pytest -m bench -s tests/bench/test_monitor_roc.py.
 
 Anomalies of a stated strength in scans of samples that no limit was tuned on: recall and latency. Clean scans, each
-hard in its own way: false findings. The tables of docs/monitor.md are what this prints, and they must hold.
+hard in its own way: false findings. docs/monitor.md sums up what this prints.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What each empirical constant of recon brings: it is removed, and the loss on small scans is measured.
 
-Run with  pytest -m bench -s tests/bench/test_thresholds.py  (an hour of one core). It prints the table of
-docs/choosing.md, with the text of recon/base/empirical.py. Eight rows of shell, teapot and foam (50 views), the
+Run with  pytest -m bench -s tests/bench/test_thresholds.py  (an hour of one core). It prints a table
+with the text of recon/base/empirical.py. Eight rows of shell, teapot and foam (50 views), the
 measured walnut (60), bone and cement; a teapot and a shell in cones whose voxels are wider than their pixels; a region
 of interest; views with wild pixels; and 12 views, too few to hold any out. PSNR in dB; of the walnut the RMS of views
 never seen. Nothing may be tuned on bone and cement: they only decide what goes.

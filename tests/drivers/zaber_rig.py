@@ -7,9 +7,9 @@ from typing import Any
 from drivers.base.clock import Clock
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.stages.zaber.stage import ZaberStage
-from simulators.wires.zaber.wire import ZaberBuild
 from tests.drivers.stages.flat_settings import flat
 from tests.drivers.stages.rig import FIGURES, StageRig
+from tests.simulators.wires.zaber.wire import ZaberBuild
 
 COUNTS = 360_000
 REPLIES_TO_OPEN = 16

@@ -75,7 +75,7 @@ class TestSiteCamera(CameraConformance):
 class TestSiteStage(StageConformance):
     @pytest.fixture
     def kind(self) -> StageKind:
-        return StageKind(width=1e-3, no_width=0.5e-3, inverts=True)
+        return StageKind(width=None, inverts=True)
 
     @pytest.fixture
     def build(self, kind: StageKind) -> Iterator[Build]:
@@ -144,7 +144,7 @@ with opened_volume(Path("v.raw")) as read:
     np.testing.assert_array_equal(read.volume.data, volume.data)
 assert ".raw" in text
 
-figures = "counts_per_turn: 360000, max_speed_deg_s: 30, acceleration_deg_s2: 60, output: 1, brake_s: 0.2"
+figures = "counts_per_turn: 360000, max_speed_deg_s: 30, acceleration_deg_s2: 60, trigger_line: 1, brake_s: 0.2"
 config = load(config_folder() / "simulated.yaml", [
     "devices.stage={kind: site_stage, port: 'sim://site_stage', %s}" % figures, "monitor.half.share=0.25",
     "simulation.clock=virtual",

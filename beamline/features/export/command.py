@@ -108,7 +108,7 @@ def export(request: ExportRequest) -> None:
 
 
 def _part_asked_for(request: ExportRequest) -> Callable[[Path, Path, bool], None] | None:
-    """What exports the part of the volume's file that --gaussians or --poses name; None: its voxels are asked for."""
+    """The exporter of what --gaussians or --poses ask for; None: they ask for nothing, so that voxels are exported."""
     parts = {
         "--gaussians": (request.gaussians, _PLY, _export_gaussians),
         "--poses": (request.poses, _CSV, _export_poses),

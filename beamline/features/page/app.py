@@ -231,11 +231,11 @@ class _Server:
         )
 
     def _of_now(self, make: Callable[[Recording], Response], *asked: object) -> Response:
-        """An answer that holds until there are more frames."""
+        """An answer that stays valid until there are more frames."""
         return self._once(make, lambda file: (file.progress(), *asked))
 
     def _once(self, make: Callable[[Recording], Response], key: Callable[[Recording], tuple[object, ...]]) -> Response:
-        """The answer that many ask for at the same time, made once: all are made in the reading thread."""
+        """One answer for all clients that ask for the same at the same time; the reading thread makes it."""
 
         def kept(file: Recording) -> Response:
             identity = key(file)

@@ -246,8 +246,7 @@ def _scan(path: Path, facts: dict[str, Any]) -> ScanSource | None:
 
 
 def _named(text: str) -> tuple[Path, str | None]:
-    """FILE::NAME as the file and the array in it; a file that has such a name itself comes first. Of the folder of a
-    run, its volume."""
+    """FILE::NAME split into file and array, unless a file has this whole name; of the folder of a run, its volume."""
     from beamline.storage.interrupted import volume_file
 
     path, separator, name = text.rpartition("::")

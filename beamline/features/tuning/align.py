@@ -30,7 +30,7 @@ ROUNDS = 3
 
 
 def align_pair(p0: NDArray[np.floating], p180: NDArray[np.floating]) -> tuple[AxisEstimate, TiltEstimate | None]:
-    """The axis from two views half a turn apart, and its tilt; None where bands of rows do not tell it.
+    """The axis from two views half a turn apart, and its tilt; None if bands of rows do not determine it.
 
     Args:
         p0, p180: float [row, col], line integrals.
@@ -90,7 +90,7 @@ _ROUNDING = 1e-9  # rad
 
 @dataclass(frozen=True)
 class Alignment:
-    """What the pair says. Lengths in mm are at the sample, angles in rad."""
+    """The findings from the pair. Lengths in mm are at the sample, angles in rad."""
 
     axis_col: float  # column of the axis at the middle row
     offset: float  # columns from the frame's middle to the axis; positive to the right, where columns are higher

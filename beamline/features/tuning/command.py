@@ -33,7 +33,7 @@ Found = TypeVar("Found", bound="Tuning | Alignment")
 @set_option
 @json_option
 def tune(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Take darks, flats and a view, and say counts, saturation, transmission, noise and the exposure to take.
+    """Take darks, flats and a view, and report counts, saturation, transmission, noise and the exposure to take.
 
     The shutter opens, the sample goes out and back, the stage turns to the view's angle and back. Two darks and two
     flats tell noise from structure. Flats and view are also taken at an eighth and a 64th of the exposure, in case
@@ -81,7 +81,7 @@ def evaluated(
 @set_option
 @json_option
 def align(file: Path, angle: float | None, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Take a pair of views half a turn apart, and say axis, tilt and sharpness, with the correction of each.
+    """Take a pair of views half a turn apart, and report axis, tilt and sharpness, with the correction of each.
 
     The shutter opens, the sample goes out and back, the stage turns to both angles and back. Mend what is said, and
     call it again. Nothing is written.

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.flag import PixelBox
-from beamline.monitor.check import AGAIN, Flag, Level, Logged, Look, ScanContext, light
+from beamline.monitor.check import AGAIN, CheckResult, Flag, Level, Logged, ScanContext, light
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame, FrameKind
 from recon.base.setting import setting
@@ -89,17 +89,19 @@ class BandsCheck(Logged):
 
     start = BandsState
 
-    def look(self, state: BandsState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[BandsState]:
+    def look(
+        self, state: BandsState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[BandsState]:
         if frame.kind is FrameKind.PROJECTION and context.view is not None:
             profiles, flag = self._both(
                 state.projection, frame, (context.view.rows, context.view.cols), digest, context
             )
-            return Look(replace(state, projection=profiles), flag)
+            return CheckResult(replace(state, projection=profiles), flag)
         if frame.kind is FrameKind.FLAT:
             counts = light(digest.preview, context)
             profiles, flag = self._both(state.flat, frame, (counts.mean(axis=1), counts.mean(axis=0)), digest, context)
-            return Look(replace(state, flat=profiles), flag)
-        return Look(state)
+            return CheckResult(replace(state, flat=profiles), flag)
+        return CheckResult(state)
 
     def _both(
         self,

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.change import FrameScatter, running_mean
-from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, again_by
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame, FrameKind
@@ -73,7 +73,7 @@ class BlurCheck(Logged):
 
     start = BlurState
 
-    def look(self, state: BlurState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[BlurState]:
+    def look(self, state: BlurState, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[BlurState]:
         looked = self._loss_of(state, frame, context)
         after = looked.state
         if context.view is None or looked.flag is not None or after.flat is None or after.views is None:
@@ -81,27 +81,27 @@ class BlurCheck(Logged):
         dark = 0.0 if after.dark is None else after.dark
         views = (*after.views, _lines(frame).astype(np.float32))
         if len(views) < VIEWS_FOR_EDGES:
-            return Look(replace(after, views=views))
+            return CheckResult(replace(after, views=views))
         overshoot, after = Overshoot.of_counts(np.stack(views), dark, after.flat), replace(after, views=None)
         if not overshoot.certain:
-            return Look(after)
+            return CheckResult(after)
         advice = f"{overshoot.in_words()} {SEARCH}"
-        return Look(after, Flag(self.name, Level.INFO, frame.index, overshoot.share, LEAST_SHARE, advice))
+        return CheckResult(after, Flag(self.name, Level.INFO, frame.index, overshoot.share, LEAST_SHARE, advice))
 
-    def _loss_of(self, state: BlurState, frame: Frame, context: ScanContext) -> Look[BlurState]:
+    def _loss_of(self, state: BlurState, frame: Frame, context: ScanContext) -> CheckResult[BlurState]:
         """What the frame has lost beside the views before."""
         if frame.kind is not FrameKind.PROJECTION:
-            return Look(_with_reference(state, frame))
+            return CheckResult(_with_reference(state, frame))
         if context.view is None:
-            return Look(state)
+            return CheckResult(state)
         if not context.follows:  # a sample may be less sharp from that side
             state = replace(state, across=FrameScatter(), down=FrameScatter(), blurred=0)
         across, down = sharpness(_lines(frame), state.dark, state.flat)
         after = replace(state, kind=frame.kind, across=_updated(state.across, across), down=_updated(state.down, down))
         if not after.across.ready:
-            return Look(after)
+            return CheckResult(after)
         if state.first is None:
-            return Look(replace(after, first=(after.across, after.down)))
+            return CheckResult(replace(after, first=(after.across, after.down)))
         losses = [_loss(now, usual) for now, usual in ((across, state.across), (down, state.down))]
         limits = [self._limit(usual) for usual in (state.across, state.down)]
         least = GONE if state.blurred else 1.0
@@ -115,23 +115,23 @@ class BlurCheck(Logged):
             f"The finest detail has {losses[worst]:.0%} less contrast{where} than in the views before: the focus "
             "moved, or the sample moved while the frame was exposed. Check focus and vibration. " + again_by(self.name)
         )
-        return Look(after, Flag(self.name, Level.WARN, frame.index, losses[worst], limits[worst], advice))
+        return CheckResult(after, Flag(self.name, Level.WARN, frame.index, losses[worst], limits[worst], advice))
 
     def _limit(self, usual: FrameScatter) -> float:
         return max(self.warn, SIGMAS * usual.sigma / usual.mean) if usual.mean > 0 else 1.0
 
-    def _slow(self, state: BlurState, row: int) -> Look[BlurState]:
+    def _slow(self, state: BlurState, row: int) -> CheckResult[BlurState]:
         """A fact, once: both directions are less sharp than in the first views."""
         assert state.first is not None
         losses = [_loss(now.mean, first) for now, first in zip((state.across, state.down), state.first, strict=True)]
         limit = max(self._limit(first) for first in state.first)
         if state.reported or limit >= LEAST or min(losses) <= limit:
-            return Look(state)
+            return CheckResult(state)
         advice = (
             f"The finest detail has {min(losses):.0%} less contrast than in the first views: the focus drifts, or the "
             "sample shows its sharp edges no more from here. Compare with the view half a turn away."
         )
-        return Look(replace(state, reported=True), Flag(self.name, Level.INFO, row, min(losses), limit, advice))
+        return CheckResult(replace(state, reported=True), Flag(self.name, Level.INFO, row, min(losses), limit, advice))
 
 
 def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | None) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from beamline.monitor.change import FrameScatter, SampleChange
-from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellView, sums_of_places
 from drivers.base.frame import Frame, FrameKind
@@ -39,20 +39,22 @@ class GainCheck(Logged):
 
     start = FrameScatter
 
-    def look(self, state: FrameScatter, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[FrameScatter]:
+    def look(
+        self, state: FrameScatter, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[FrameScatter]:
         if context.change is None:
-            return Look(state)
+            return CheckResult(state)
         score = _everywhere(context.change, context.view)
         after = state.with_figure(score)
         limit = max(self.warn, SIGMAS * state.sigma)
         if not state.ready or abs(score - state.mean) <= limit:
-            return Look(after)
+            return CheckResult(after)
         level, limit = (Level.ALARM, self.alarm) if abs(score) > self.alarm else (Level.WARN, limit)
         advice = (
             f"{score:+.1%} of light from one view to the next, equally everywhere: a top-up, a filter or slit that "
             "moved, or the camera's gain. Take new flats."
         )
-        return Look(after, Flag(self.name, level, frame.index, score, limit, advice))
+        return CheckResult(after, Flag(self.name, level, frame.index, score, limit, advice))
 
 
 def _everywhere(change: SampleChange, view: CellView | None) -> float:
@@ -80,7 +82,7 @@ class ZingersState:
 
 @dataclass(frozen=True)
 class ZingersCheck(Logged):
-    """Score: zingers of the frame over its pixels. Their number is said once, as a fact.
+    """Score: zingers of the frame over its pixels. Their number is reported once, as a fact.
 
     The default: at 1e-4 a slice 2000 pixels wide of as many views has 400 rays with one, each a streak if it stays.
     """
@@ -94,9 +96,11 @@ class ZingersCheck(Logged):
 
     start = ZingersState
 
-    def look(self, state: ZingersState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[ZingersState]:
+    def look(
+        self, state: ZingersState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[ZingersState]:
         if frame.kind is not FrameKind.PROJECTION:
-            return Look(state)
+            return CheckResult(state)
         n = context.spots.n
         state = replace(state, views=state.views + 1, zingers=state.zingers + n)
         score = n / context.pixels
@@ -105,12 +109,12 @@ class ZingersCheck(Logged):
                 f"{n} bright spots that are in no other frame. `beamline recon` fills those of up to 3 x 3 pixels, "
                 "but so many hide what is behind them: shield the detector against scattered and direct X-rays."
             )
-            return Look(state, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
+            return CheckResult(state, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
         if state.views != VIEWS or not state.zingers:
-            return Look(state)
+            return CheckResult(state)
         advice = (
             f"The first {VIEWS} views have {state.zingers} bright spots that are in one frame only. `beamline recon` "
             "fills those of up to 3 x 3 pixels from their neighbours."
         )
         score = state.zingers / VIEWS / context.pixels
-        return Look(state, Flag(self.name, Level.INFO, frame.index, score, self.warn, advice))
+        return CheckResult(state, Flag(self.name, Level.INFO, frame.index, score, self.warn, advice))

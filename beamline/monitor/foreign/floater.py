@@ -15,7 +15,7 @@ import numpy as np
 
 from beamline.core.flag import PixelBox
 from beamline.monitor.change import MOST_STEPS
-from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.foreign.track import Octave, SampleMotion, Track, tracks_of, with_view
 from beamline.monitor.view import CellGrid
@@ -84,13 +84,15 @@ class FloaterCheck(Logged):
 
     start = FloaterState
 
-    def look(self, state: FloaterState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[FloaterState]:
+    def look(
+        self, state: FloaterState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[FloaterState]:
         view, grid = context.view, context.grid
         if view is None or grid is None:
-            return Look(state)
+            return CheckResult(state)
         state = _after(state, view.angle, context.follows)
         if not state.step < COARSEST:
-            return Look(state)
+            return CheckResult(state)
         half = grid.shape[1] / 2
         octaves, tracks = [], list[Track]()
         for before in state.octaves:
@@ -102,9 +104,9 @@ class FloaterCheck(Logged):
             octaves.append(octave)
         state = replace(state, octaves=tuple(octaves))
         sure = [track for track in tracks if _is_crumb(track)]
-        return self._flagged(state, max(sure, key=lambda track: track.score), grid) if sure else Look(state)
+        return self._flagged(state, max(sure, key=lambda track: track.score), grid) if sure else CheckResult(state)
 
-    def _flagged(self, state: FloaterState, track: Track, grid: CellGrid) -> Look[FloaterState]:
+    def _flagged(self, state: FloaterState, track: Track, grid: CellGrid) -> CheckResult[FloaterState]:
         """The flag for the views that show the crumb, since the last flag for it."""
         newest, oldest = track.steps[0], track.steps[-1]
         top, below = _rows(track)
@@ -117,7 +119,7 @@ class FloaterCheck(Logged):
             after = replace(after, crumbs=(*others, replace(crumb, first=min(first, crumb.first))))
         begin = max([crumb.first, *(each.last + 1 for each in known if crumb.first >= each.first)])
         if begin > crumb.last:
-            return Look(after)
+            return CheckResult(after)
         span = max(newest.time - oldest.time, 1.0)
         share = (crumb.last - begin) / max(crumb.last - crumb.first, 1)
         where = [_region(grid, crumb, col) for col in (crumb.col, crumb.col - track.speed * span * share)]
@@ -130,7 +132,7 @@ class FloaterCheck(Logged):
             "less weight."
         )
         flag = Flag(self.name, Level.WARN, crumb.last, track.score, self.warn, advice, where[0], begin, where[1])
-        return Look(after, flag)
+        return CheckResult(after, flag)
 
 
 def _after(state: FloaterState, angle: float, follows: bool) -> FloaterState:

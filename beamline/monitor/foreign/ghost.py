@@ -15,7 +15,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.check import Flag, Level, Logged, Look, ScanContext, again_by
+from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, again_by
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues, sums_of_places
 from drivers.base.frame import Frame
@@ -148,17 +148,19 @@ class GhostCheck(Logged):
 
     start = GhostState
 
-    def look(self, state: GhostState, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[GhostState]:
+    def look(
+        self, state: GhostState, frame: Frame, digest: FrameDigest, context: ScanContext
+    ) -> CheckResult[GhostState]:
         view, grid = context.view, context.grid
         if view is None or grid is None or view.depth.shape[1] < COLUMNS:
-            return Look(state)
+            return CheckResult(state)
         if context.change is None:
-            return Look(GhostState((_profiles(view.depth, view.weight),), view.angle))
+            return CheckResult(GhostState((_profiles(view.depth, view.weight),), view.angle))
         step = abs(view.angle - state.angle)
         profiles = (*state.profiles, _profiles(view.depth, view.weight))
         state = replace(state, profiles=profiles[-max(CALIBRATION, -LAGS[0] * MOST_STRIDE + 1) :], angle=view.angle)
         if len(profiles) < CALIBRATION:
-            return Look(state)
+            return CheckResult(state)
         stride = max(1, min(MOST_STRIDE, round(SWEEP / max(step, 1e-9))))
         radius = COLUMNS / 2 * (WIDER if context.truncated else 1.0)
         if state.filters is None or not abs(radius * step / state.step - 1) < 0.2:
@@ -166,14 +168,14 @@ class GhostCheck(Logged):
             state = replace(state, filters=made, step=radius * step, usual=None)
         assert state.filters is not None
         if not state.filters.speeds.size:
-            return Look(state)
+            return CheckResult(state)
         chosen = np.stack([state.profiles[-1 + lag * stride] for lag in LAGS])
         outputs = correlate(chosen, state.filters.weights)
         return self._judge(state, frame.index, outputs, radius * step / (COLUMNS / 2), context)
 
     def _judge(
         self, state: GhostState, now: int, outputs: CellValues, turn: float, context: ScanContext
-    ) -> Look[GhostState]:
+    ) -> CheckResult[GhostState]:
         """The highest output, relative to the usual one there, and the peaks of earlier views."""
         assert state.filters is not None and context.grid is not None
         parts, outputs = outputs, outputs.mean(axis=1)
@@ -186,14 +188,14 @@ class GhostCheck(Logged):
         usual = usual + np.float32(MEMORY) * (np.minimum(spread, OUTLIER * usual) - usual)
         state = replace(state, usual=usual, peaks=old)
         if abs(score) <= PEAK or abs(depth) <= self.warn:
-            return Look(state)
+            return CheckResult(state)
         if np.percentile(parts[signal, :, col] / outputs[signal, col], MOST_PARTS) <= ALIKE:
-            return Look(state)
+            return CheckResult(state)
         peaks = (*old, Peak(now, float(col), score))
         state = replace(state, peaks=peaks)
         trail = best_trail(peaks, FASTER * turn)
         if trail is None:
-            return Look(state)
+            return CheckResult(state)
         light = abs(math.expm1(-depth))
         level, limit = (Level.ALARM, self.alarm) if light > self.alarm else (Level.WARN, self.warn)
         rows, cols = context.grid.shape
@@ -205,7 +207,7 @@ class GhostCheck(Logged):
             "Something between source and detector reflects or shadows the beam and moves with the stage: find it. "
             + again_by(self.name)
         )
-        return Look(state, Flag(self.name, level, now, light, limit, advice, region, trail.first))
+        return CheckResult(state, Flag(self.name, level, now, light, limit, advice, region, trail.first))
 
 
 def _profiles(depth: CellValues, weight: CellValues) -> CellValues:

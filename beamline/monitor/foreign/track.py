@@ -124,7 +124,7 @@ class Track(NamedTuple):
 
     @property
     def speed(self) -> float:
-        """Mean, in cells a view."""
+        """Mean speed, cells per view."""
         return float((self.cols[0] - self.cols[-1]) / (self.steps[0].time - self.steps[-1].time))
 
 
@@ -152,8 +152,9 @@ def with_view(octave: Octave, row: int, time: float, depth: CellValues, weight: 
 
 
 def _change(before: CellValues, own: CellValues, after: CellValues, weight: CellValues) -> tuple[CellValues, float]:
-    """What the neighbours do not explain, without what rows and columns have in common, smoothed; and the standard
-    deviation of its noise in a cell of weight 1."""
+    """The change that neighbouring views do not explain, less what rows and columns have in common, smoothed; and the
+    standard deviation of its noise in a cell of weight 1.
+    """
     lit, root, apart = weight > LIT, np.sqrt(weight), before - after
     change = (own - 0.5 * (before + after)) * lit
     sample = (change * root).ravel()[::SAMPLED][lit.ravel()[::SAMPLED]]
@@ -173,8 +174,9 @@ def _change(before: CellValues, own: CellValues, after: CellValues, weight: Cell
 def _noise(
     change: CellValues, weight: CellValues, noise: float, usual: CellValues | None, newest: float
 ) -> tuple[CellValues, CellValues]:
-    """Standard deviation of the change at each cell, and the usual square after it: edges of the sample that pass
-    deviate usually, there and beside."""
+    """Standard deviation of the change at each cell, and its usual square after this view; both are larger at and
+    beside edges of the sample.
+    """
     least = np.float32(noise**2) / np.maximum(weight, np.float32(LIT))
     if usual is None:
         usual = np.maximum(scipy.ndimage.uniform_filter(change**2, 5, mode="nearest"), least)
@@ -244,7 +246,7 @@ def _track(octave: Octave, row: int, col: float, speed: float, sample: SampleMot
 
 
 def _ended(change: CellValues, noise: CellValues, cols: NDArray[np.float64]) -> int:
-    """Newest steps without which the score is largest: the crumb has gone. More than SEED are left."""
+    """Number of newest steps to leave out for the largest score, as the crumb has gone; more than SEED remain."""
     at = np.arange(cols.size), np.clip(np.floor(cols + 0.5).astype(int), 0, change.shape[1] - 1)
     weight = noise[at].astype(float) ** -2
     evidence = np.minimum(change[at] / noise[at], CLIP) * np.sqrt(weight)

@@ -151,7 +151,7 @@ def _later_flats(file: h5py.File, n: int) -> int | None:
 
 
 def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
-    """Radians of each of so many frames, in the unit of the views where it states none; None without such a list."""
+    """Angles [frame] in radians, in the unit of the views if none is stated; None without a list of this length."""
     item = datasets.dataset(file, where)
     if item is None or item.size != n or item.dtype.kind not in "uif":
         return None
@@ -162,7 +162,7 @@ def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
 
 
 def _set_exposures(table: FrameTable, file: h5py.File) -> None:
-    """Set exposures: one of all frames, or of each view; and of flats, where the acquisition states another one."""
+    """Set exposures: one for all frames or for each view, and that of the flats if another one is stated."""
     seconds = _seconds(file, f"{_DETECTOR}/exposure_time", table.views.size)
     if seconds is None:
         return
@@ -175,7 +175,7 @@ def _set_exposures(table: FrameTable, file: h5py.File) -> None:
 
 
 def _seconds(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
-    """Positive times, one or so many; None where the file has no such, or in an unknown unit."""
+    """Positive times in s, one or one for each frame; None if the file has none, or in an unknown unit."""
     item = datasets.dataset(file, where)
     values = None if item is None or item.size not in (1, n) else datasets.in_units(item, EXCHANGE_TIME_UNITS)
     return values if values is not None and (values > 0).all() else None
@@ -219,7 +219,7 @@ def _set_scale(source: ExchangeSource, file: h5py.File) -> None:
 def _measured(
     source: ExchangeSource, file: h5py.File, where: str, units: Mapping[str, float], range: tuple[float, float]
 ) -> float | None:
-    """A positive number. One without a unit counts in the SI's, as the format says, if it then lies in a range."""
+    """A positive number; without a unit it is taken as SI, as the format says, if it then lies in a range."""
     value, item = _positive(file, where, units), datasets.dataset(file, where)
     if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
         return value

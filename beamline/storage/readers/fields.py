@@ -75,7 +75,7 @@ def stated_in(fields: Sequence[Entry], root: h5py.Group, source: ScanSource, det
 
 
 def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source: ScanSource) -> str:
-    """Why a number that would be used is not; "" where its unit is known, or nothing is stated."""
+    """Why a stated number cannot be used for its unit; "" if the unit is known, or nothing is stated."""
     stated = datasets.text(value) if value.dtype.kind in "SO" else _true(value, item, source)
     if field.units is None or not stated or datasets.in_units(item, field.units) is not None:
         return ""
@@ -86,8 +86,9 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
 
 
 def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> tuple[str, float]:
-    """What one length for all views does, where the file states others for some, and their share of it; "" where nobody
-    sees that."""
+    """The effect of taking one length for all views, where the file states others for some, and their share; "" if it
+    is not visible.
+    """
     lengths = None if field.units is None or "mm" not in field.units else datasets.in_units(item, field.units)
     if lengths is None or lengths.size == 1:
         return "", 0.0

@@ -21,7 +21,7 @@ _COPIED = {*ScanSource.__annotations__} - {"table", "unreadable", "facts", "stat
 
 
 class Frames(ScanSource):
-    """The frames of some sources, one source after the other. What is not of single frames is that of the last source.
+    """The frames of several sources, one after the other; facts of the whole scan are those of the last source.
 
     Row numbers, such as the row that a frame replaces, count from the first frame of all.
     """

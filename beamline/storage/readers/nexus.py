@@ -271,7 +271,7 @@ def read_energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
 
 
 def _energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
-    """Energies in keV, so many, from the first place that has them in a known unit."""
+    """`n` energies in keV, from the first place that has them in a known unit."""
     for energy, wavelength, groups_ in (
         ("incident_energy", "incident_wavelength", _BEAMS),
         ("energy", "wavelength", (_MONOCHROMATOR,)),

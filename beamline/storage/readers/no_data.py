@@ -65,7 +65,7 @@ def no_data_of(source: ScanSource) -> Mask | None:
 
 
 def _ends(source: ScanSource) -> list[Mask]:
-    """Where some flats and views of all the scan are at the end of their type; [] where one is nowhere."""
+    """Pixels at the end of their type in sampled flats and views; [] if one of these frames has none."""
     ends = []
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         for row in spread(source.table.of_kind(kind), _LOOKED_AT):

@@ -162,7 +162,9 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         side = side_of(base) if options.side_file is None else None
         if side is None:
             raise
-        raise DataError(f"{error} Beside it lies {side.path.name}: --from {side.path} takes it ({side}).") from error
+        raise DataError(
+            f"{error} Beside it lies {side.path.name}: --scanner-file {side.path} takes it ({side})."
+        ) from error
     except BaseException:
         base.close()
         raise
@@ -281,8 +283,8 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
 
 
 def _true_type(source: ScanSource) -> np.dtype[Any] | None:
-    """The real type of pixels that are bits of such, or the type without a sign of counts that wrapped, which holds all
-    of them; None: they are what they are stored as.
+    """The type that pixels really have: reals stored as whole numbers, or unsigned counts that wrapped, wide enough for
+    all of them; None: as stored.
     """
     if source.dtype.kind == "u":
         some = [each for each in _some_of_each_kind(source) if each.any()]
@@ -350,12 +352,12 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     """DataError for options that exclude each other."""
     own = ("angles", "darks", "flats", "data_path", "angles_path")
     replaced = [f"--{name.replace('_', '-')}" for name in own if getattr(options, name) is not None]
-    own_kinds = {"horizontal-axis": options.horizontal_axis, "frames": options.frames, "then": options.then}
-    replaced += [f"--{name}" for name, given in (own_kinds | {"from": options.side_file}).items() if given]
+    own_kinds = {"horizontal-axis": options.horizontal_axis, "frames": options.frames, "append": options.then}
+    replaced += [f"--{name}" for name, given in (own_kinds | {"scanner-file": options.side_file}).items() if given]
     if follow and replaced:
         raise DataError(
             f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "
-            "frames, and they still come."
+            "frames, and more are still to come."
         )
     for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
         if getattr(options, one) is not None and getattr(options, other) is not None:

@@ -22,7 +22,7 @@ Order = tuple[int | None, int | None, int | None]
 
 
 class TurnedFrames:
-    """An array read as [frame, row, col], whatever the order of its dimensions; others it has are of length one."""
+    """An array read as [frame, row, col], whatever the order of its dimensions; any further ones have length one."""
 
     def __init__(self, item: Any, order: Order) -> None:
         self.item, self._order = item, order
@@ -78,8 +78,9 @@ SINOGRAM = (0, None, 1)
 
 
 def dimensions_without_ones(shape: tuple[int, ...], n: int = 3) -> dict[int, int]:
-    """The n dimensions of a shape: place and length. Others, where there are more, have length one: the last one, which
-    no column of pixels is, or the first of them."""
+    """The n dimensions of a shape, length by place. Surplus ones have length one: the last, which cannot be columns,
+    goes first, then the first.
+    """
     sizes = dict(enumerate(shape))
     while len(sizes) > n and 1 in sizes.values():
         last = max(sizes)

@@ -167,7 +167,7 @@ def side_of(source: ScanSource) -> SideFile | None:
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
     """A sentence on what a vendor's file beside these images states."""
     side = side_of(source)
-    return () if side is None else (NotUsed(side.path.name, str(side), f"--from {side.path} takes it", True),)
+    return () if side is None else (NotUsed(side.path.name, str(side), f"--scanner-file {side.path} takes it", True),)
 
 
 def _candidates(scan: Path) -> Iterator[Path]:
@@ -254,7 +254,7 @@ def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n:
 
 
 def _listed_angles(path: Path, n: int) -> NDArray[np.float64] | None:
-    """Degrees of each projection in the `_ctdata.txt` beside Nikon's file; None where it is not there or of others."""
+    """Degrees of each projection in `_ctdata.txt` beside Nikon's file; None if it is missing, or of another scan."""
     files = sorted(path.parent.glob("*_ctdata.txt"))
     if len(files) != 1:
         return None

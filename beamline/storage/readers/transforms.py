@@ -211,8 +211,8 @@ def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
 
 
 def as_unsigned(base: ScanSource, dtype: np.dtype[Any]) -> ScanSource:
-    """A scan of the numbers that `base` stores as others: unsigned counts as signed ones, so that large counts appear
-    negative, or reals as whole numbers.
+    """A scan whose pixels are read as their true type: unsigned counts that were stored as signed ones, or reals that
+    were stored as whole numbers.
     """
     wrapped = f"int{8 * dtype.itemsize} that wrapped"
     what = "real numbers by their bits, as no SampleFormat in the TIFF says" if dtype.kind == "f" else wrapped

@@ -337,7 +337,7 @@ class NXtomoWriter:
         )
 
     def _put_exchange_view(self) -> None:
-        """The only thing that SWMR writing cannot do, since it creates datasets: the frames do not hang on it."""
+        """Add the /exchange view, which SWMR writing cannot, as it creates datasets; no frame depends on it."""
         if hdf5.grows_here(self.path):  # where h5py has it open, HDF5 would cut the view off when that is closed
             self.remarks.append(
                 f"{self.path} has no /exchange view, as this program has the file open by h5py. Close it there, then "

@@ -91,7 +91,7 @@ class PartialVolume:
         self._maps[name].flush()
 
     def _take_out(self) -> None:
-        """Take out the slab that was added by half, if there is one."""
+        """Remove the slab that was only partly added, if there is one."""
         for n in np.flatnonzero(self._maps["state"] == _ADDING).tolist():
             shared = _shared(self.slabs[n])
             self.volume[shared] = self._maps["shared_before"][: len(shared)]

@@ -232,7 +232,7 @@ class EpicsStage(LineStage):
 
     @property
     def _seen_to_stand(self) -> bool:
-        """Its place was the same in every look of the last `STILL`."""
+        """Whether its place was the same in every reading of the last `STILL` s."""
         return self._looked - self._same_since >= STILL
 
     def _is_at_target(self, status: MotorStatus) -> bool:

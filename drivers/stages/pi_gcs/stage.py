@@ -147,7 +147,7 @@ class PiGcsStage(LineStage):
             self._axis.restore()
 
     def _refuse_untold(self) -> None:
-        """DeviceError, once, for what happened to the standing axis since its last move."""
+        """Raise DeviceError, once, for what disturbed the standing axis since its last move."""
         code = self._line.fault
         if code not in MOTION or code == self._told:
             return

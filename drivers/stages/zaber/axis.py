@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import re
 from dataclasses import dataclass
 
 from drivers.base.clock import Clock
@@ -24,7 +23,6 @@ from drivers.stages.zaber.packet import (
     encode,
     passed_over_form,
     reply_form,
-    reply_of,
 )
 from drivers.stages.zaber.settings import ZaberSettings
 
@@ -36,18 +34,6 @@ TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
 CHECKSUM = "comm.checksum"
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
 """Settings of the axis that survive a power cycle; the driver restores them, and the device's checksums, at the end."""
-
-
-@dataclass(frozen=True)
-class Identity:
-    number: str
-    serial: str
-    firmware: str
-
-    @property
-    def has_triggers(self) -> bool:
-        """Whether the firmware has triggers: 7.06 or later."""
-        return tuple(int(part) for part in self.firmware.split(".")[:2]) >= (7, 6)
 
 
 @dataclass(frozen=True)
@@ -78,12 +64,9 @@ class ZaberAxis:
     """
 
     def __init__(self, url: str, settings: ZaberSettings, clock: Clock, name: str) -> None:
-        device = settings.device
-        self.number = settings.axis
-        self._name, self._device, self._axis, self._clock = name, device, settings.axis, clock
+        self._name, self._device, self._axis, self._clock = name, settings.device, settings.axis, clock
         self._ids = itertools.cycle(range(IDS))
-        self._must_have_checksum = False
-        self._commanded = False
+        self._must_have_checksum = self._commanded = False
         self.last_move = ""
         """The command of the last move or search, for errors."""
         self.found = FoundSettings()
@@ -94,50 +77,30 @@ class ZaberAxis:
             url,
             name,
             clock,
-            Probe(encode(device, 0, PROBE_ID, ""), reply_form(device, 0, PROBE_ID, TEXT)),
+            Probe(encode(self._device, 0, PROBE_ID, ""), reply_form(self._device, 0, PROBE_ID, TEXT)),
             unsolicited=passed_over_form(STOP_ID),
             identified=True,
             check=lambda line: damage(line, must_have_checksum=self._must_have_checksum),
         )
 
-    def open(self) -> Identity:
+    def open(self) -> dict[str, str]:
         """Switch checksums on, identify the device, remember the settings that will change."""
         self._line.send("")  # an empty line ends an incomplete command in the device
-        if (checksums := self._get_if_known(CHECKSUM)) is not None:
+        if (checksums := self.get_if_known(CHECKSUM, 0)) is not None:
             self.ask(f"set {CHECKSUM} 1")
             self._must_have_checksum = True
-        number = self._get_if_known("device.id") or self.ask("get deviceid", WHOLE).data
-        identity = Identity(number, self.ask("get system.serial", WHOLE).data, self.ask("get version", NUMBER).data)
-        flags = self.standing("opening").flags
-        self.flags_at_opening = tuple(flag for flag in flags if flag != INTERRUPTED)
-        self.found.values = {setting: self.get(setting) for setting in KEPT}
+        number = self.get_if_known("device.id", 0) or self.ask("get deviceid", WHOLE)
+        serial, firmware = self.ask("get system.serial", WHOLE), self.ask("get version", NUMBER)
+        self.flags_at_opening = tuple(flag for flag in self.standing("opening").flags if flag != INTERRUPTED)
+        self.found.values = {setting: self.ask_axis(f"get {setting}", NUMBER) for setting in KEPT}
         if checksums is not None:
             self.found.values[CHECKSUM] = checksums
-        return identity
-
-    def cycle(self) -> str | None:
-        """Microsteps of a full turn in the device; None if it has no such setting."""
-        return self._get_if_known("limit.cycle.dist", axis=True)
-
-    def travel(self) -> tuple[int, int]:
-        """Limits of the device itself in microsteps."""
-        low, high = (int(self.get(f"limit.{end}", WHOLE)) for end in ("min", "max"))
-        return low, high
-
-    def get(self, setting: str, form: str = NUMBER) -> str:
-        return self.ask_axis(f"get {setting}", form).data
-
-    def set(self, setting: str, value: str | int) -> None:
-        self.ask_axis(f"set {setting} {value}")
+        return {"model": f"Zaber device {number}", "serial": serial, "firmware": firmware}
 
     def status(self) -> ZaberAxisStatus:
-        reply = self.ask_axis("get pos", WHOLE)
-        flags = self._flags("warnings") if reply.flag else ()
-        return ZaberAxisStatus(int(reply.data), reply.busy, flags, reply.raw)
-
-    def forget_flags(self) -> None:
-        """Clear the flags of past events."""
-        self.ask_axis("warnings clear", TEXT)
+        reply = self._ask(self._axis, "get pos", WHOLE)
+        flags = self.ask_axis("warnings", r"\d+(?: \w\w)*").split()[1:] if reply.flag else ()
+        return ZaberAxisStatus(int(reply.data), reply.busy, tuple(flags), reply.raw)
 
     def standing(self, purpose: str) -> ZaberAxisStatus:
         """The status; refuses `purpose` while the axis moves."""
@@ -146,23 +109,28 @@ class ZaberAxis:
             raise while_it_moves(self._name, purpose, status.counts, status.raw)
         return status
 
-    def move(self, target: int) -> None:
-        self._begin(f"move abs {target}")
-
-    def home(self) -> None:
-        self._begin("home")
+    def begin(self, words: str) -> None:
+        """Begin a move or a search."""
+        self._commanded, self.last_move = True, words
+        self.ask_axis(words)
 
     def stop(self, words: str) -> str:
         """Send `stop` or `estop` without waiting, and return it; its reply is skipped when it comes."""
         self._line.send(packet := encode(self._device, self._axis, STOP_ID, words))
         return packet
 
-    def ask(self, words: str, form: str = TEXT) -> Reply:
-        """Ask the device itself."""
-        return self._ask(0, words, form)
+    def ask(self, words: str, form: str = TEXT) -> str:
+        """Data of the reply of the device itself."""
+        return self._ask(0, words, form).data
 
-    def ask_axis(self, words: str, form: str = TEXT) -> Reply:
-        return self._ask(self._axis, words, form)
+    def ask_axis(self, words: str, form: str = TEXT) -> str:
+        return self._ask(self._axis, words, form).data
+
+    def get_if_known(self, setting: str, axis: int) -> str | None:
+        """A setting of an axis, or of the device itself (0); None if it has no such setting."""
+        with contextlib.suppress(DeviceRefused):
+            return self._ask(axis, f"get {setting}", NUMBER).data
+        return None
 
     def close(self) -> None:
         """Restore the settings, and free the port even if the line is dead."""
@@ -172,23 +140,9 @@ class ZaberAxis:
             self._line.close()
 
     def _restore(self, setting: str, value: str) -> None:
-        if setting != CHECKSUM:
-            self.set(setting, value)
-        elif value != "1":
-            self._must_have_checksum = False
-            self.ask(f"set {CHECKSUM} {value}")
-
-    def _begin(self, words: str) -> None:
-        self._commanded, self.last_move = True, words
-        self.ask_axis(words)
-
-    def _flags(self, words: str) -> tuple[str, ...]:
-        return tuple(self.ask_axis(words, r"\d+(?: \w\w)*").data.split()[1:])
-
-    def _get_if_known(self, setting: str, *, axis: bool = False) -> str | None:
-        with contextlib.suppress(DeviceRefused):
-            return self._ask(self._axis if axis else 0, f"get {setting}", NUMBER).data
-        return None
+        if setting == CHECKSUM:
+            self._must_have_checksum = value == "1"
+        self._ask(0 if setting == CHECKSUM else self._axis, f"set {setting} {value}", TEXT)
 
     def _ask(self, axis: int, words: str, form: str) -> Reply:
         for _ in range(REPEATS):
@@ -211,5 +165,4 @@ class ZaberAxis:
         state = "A move was started before; the stage may be turning" if self._commanded else "Nothing has moved"
         identity = next(self._ids)
         request, meaning = encode(self._device, axis, identity, words), f"the reply to message {identity:02d}"
-        match: re.Match[str] = self._line.query(request, reply_form(self._device, axis, identity, form), meaning, state)
-        return reply_of(match)
+        return Reply.of(self._line.query(request, reply_form(self._device, axis, identity, form), meaning, state))

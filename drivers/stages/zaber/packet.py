@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-
-LONGEST_PACKET = 80
-"""Bytes that a device takes by default (comm.packet.size.max); splitting longer ones is not needed here."""
+from typing import Self
 
 
 @dataclass(frozen=True)
@@ -93,6 +91,11 @@ class Reply:
     data: str
     raw: str
 
+    @classmethod
+    def of(cls, match: re.Match[str]) -> Self:
+        """The reply that matched `reply_form`."""
+        return cls(match[1] is not None, match[2] == "BUSY", match[3].strip("-"), match[4], match[0])
+
 
 def lrc(body: str) -> str:
     """Longitudinal redundancy check: the negative sum of the bytes after the type character, two hex digits."""
@@ -100,16 +103,9 @@ def lrc(body: str) -> str:
 
 
 def encode(device: int, axis: int, identity: int, words: str) -> str:
-    """A command packet without its line end.
-
-    Raises:
-        ValueError: it is too long for devices, or has a character that would end or split it.
-    """
+    """A command packet without its line end."""
     body = f"{device} {axis} {identity:02d} {words}".rstrip()
-    packet = f"/{body}:{lrc(body)}"
-    if len(packet) > LONGEST_PACKET or not re.fullmatch(r"[^/@#!\\:\r\n]*", body):
-        raise ValueError(f"{words!r} does not go into one packet of {LONGEST_PACKET} bytes")
-    return packet
+    return f"/{body}:{lrc(body)}"
 
 
 def damage(line: str, *, must_have_checksum: bool) -> str:
@@ -140,11 +136,6 @@ def passed_over_form(identity: int) -> str:
     id.
     """
     return rf"|[!#/].*|@\d\d \d {identity:02d} .*"
-
-
-def reply_of(match: re.Match[str]) -> Reply:
-    """The reply that matched `reply_form`."""
-    return Reply(match[1] is not None, match[2] == "BUSY", match[3].strip("-"), match[4], match[0])
 
 
 def meaning_of(flags: tuple[str, ...]) -> Meaning | None:

@@ -1,14 +1,13 @@
 """Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output by distance.
 
 Positions are commanded microsteps unless `measured`. Facts about the firmware that are from memory are settings:
-`speed_unit` and `drivers.stages.zaber.settings.TriggerUse`.
+those of `ZaberSettings`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 from drivers.base.clock import Clock
@@ -16,83 +15,14 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
 from drivers.stages.shared import LineStage, StageOutput, found_at_opening, refuse_another, until_standing
 from drivers.stages.travel import Travel
-from drivers.stages.zaber.axis import ZaberAxis, ZaberAxisStatus
+from drivers.stages.zaber.axis import WHOLE, ZaberAxis, ZaberAxisStatus
 from drivers.stages.zaber.packet import INTERRUPTED, LOST, SLIPPED, meaning_of
-from drivers.stages.zaber.settings import PulseSettings, ZaberSettings, has_started, remaining, set_up
+from drivers.stages.zaber.settings import ZaberSettings, set_up
 
 ADVICE = (
     "Firmware without `schedule` needs toggle; firmware whose actions enable no triggers needs chained: false, and "
     "room for one step before the first pulse"
 )
-
-
-class ZaberPulses:
-    """Sets up and takes away pulse trains.
-
-    Raises (in all methods):
-        DeviceRefused, DeviceError, DeviceTimeout: as `ZaberAxis`.
-    """
-
-    def __init__(self, axis: ZaberAxis, settings: PulseSettings, name: str) -> None:
-        self.settings = settings
-        self._axis, self._name = axis, name
-        self._train: TriggerTrain | None = None
-        self._touched = True
-
-    def arm(self, train: TriggerTrain, counts: int, stand_at: Callable[[int], None]) -> None:
-        """Set up the triggers for a train and enable the first one.
-
-        Args:
-            counts: where the stage stands.
-            stand_at: turns the stage to another place.
-        """
-        setup = set_up(self.settings, train, self._axis.number, counts)
-        self._train, self._touched = None, True
-        try:
-            for command in setup.commands:
-                self._axis.ask(command)
-            if setup.stand not in (None, counts):
-                stand_at(setup.stand)
-            self._axis.ask(setup.enable)
-        except DeviceRefused as problem:
-            raise DeviceRefused(
-                self._name,
-                f"the triggers cannot be set up: {problem.problem}",
-                request=problem.request,
-                reply=problem.reply,
-                advice=ADVICE,
-                state="This train is not armed",
-            ) from problem
-        self._train = train
-
-    def disarm(self) -> None:
-        """Disable the triggers and put the output at rest, unless this was done already."""
-        if self._touched:
-            for command in (*self.settings.disable, self.settings.rest):
-                self._axis.ask(command)
-            self._train, self._touched = None, False
-
-    def before_move(self, counts: int, target: int) -> None:
-        """Keep a train correct before a move from `counts` against it, because distance counts both ways.
-
-        A train under way ends. A train before its first pulse is set up anew, or ends if the stage had to move for it.
-        """
-        train = self._train
-        if train is None or train.interval * (target - counts) >= 0 or not has_started(self.settings, self._shown()):
-            return
-        if self.settings.triggers.chained and remaining(self.settings, train, self._shown()) == train.n:
-            self.arm(train, counts, _nowhere)
-        else:
-            self.disarm()
-
-    def _shown(self) -> str:
-        """The reply to `trigger show`, for at least this many triggers."""
-        needed = max(self.settings.triggers.starter, self.settings.triggers.repeater)
-        return self._axis.ask("trigger show", rf"(?:[de]|\d+)(?: (?:[de]|\d+)){{{needed - 1},}}").data
-
-
-def _nowhere(counts: int) -> None:
-    """Does nothing: a chained train may be set up at any place of the stage."""
 
 
 STANDING_IN_PLACE = 10.0  # s beyond twice the time of a short move after which it has failed
@@ -115,17 +45,19 @@ class ZaberStage(LineStage):
         super().__init__(url, settings, clock, name)
         self._settings, (self._fastest, steepest) = settings, settings.native_limits
         self._told = frozenset[str]()  # flags that an error, or the description, has told
+        self._train: TriggerTrain | None = None
+        self._touched = True  # the triggers, since they were disabled
         self._axis = ZaberAxis(url, settings, clock, name)
-        self._found, self._pulses = self._axis.found, ZaberPulses(self._axis, settings.pulses, name)
+        self._found = self._axis.found
         with self._closed_on_failure():
             self._identity = self._axis.open()
-            refuse_another(name, settings.serial, self._identity.serial)
+            refuse_another(name, settings.serial, self._identity["serial"])
             self._told = frozenset(self._axis.flags_at_opening)
             self._check_turn_and_travel()
-            self._axis.set("accel", steepest)
-            if self._identity.has_triggers:
-                self._pulses.disarm()  # a train left by a program that died
-        self._travel = Travel(name, replace(settings.limits(), trigger_output=self._identity.has_triggers))
+            self._axis.ask_axis(f"set accel {steepest}")
+            version = [int(part) for part in self._identity["firmware"].split(".")]
+            self._travel = Travel(name, replace(settings.limits(), trigger_output=version >= [7, 6]))
+            self.disarm()  # a train left by a program that died
 
     @staticmethod
     def halt(url: str, settings: ZaberSettings, clock: Clock) -> None:
@@ -154,10 +86,10 @@ class ZaberStage(LineStage):
                     state="Nothing has moved",
                 )
             self._refuse_untold(status)
-            self._pulses.before_move(status.counts, target)
+            self._before_move(status.counts, target)
             self._forget_flags(status)
-            self._axis.set("maxspeed", native)
-            self._axis.move(target)
+            self._axis.ask_axis(f"set maxspeed {native}")
+            self._axis.begin(f"move abs {target}")
         self._target, self._searching = target, False
 
     def start_home(self) -> None:
@@ -166,7 +98,7 @@ class ZaberStage(LineStage):
             status = self._axis.standing("a search for the reference")
             self.disarm()
             self._forget_flags(status)
-            self._axis.home()
+            self._axis.begin("home")
         self._target, self._searching = None, True
 
     def moving(self) -> bool:
@@ -202,45 +134,48 @@ class ZaberStage(LineStage):
         if not self.limits.trigger_output:
             raise DeviceRefused(
                 self.name,
-                f"its firmware {self._identity.firmware} has no triggers",
+                f"its firmware {self._identity['firmware']} has no triggers",
                 expected="7.06 or later",
                 advice="Update the firmware with the vendor's software",
                 state="Nothing has moved and this train is not armed",
             )
         stops, counts = self._stops.count, self._axis.standing("arming").counts
         self._travel.refuse_late_arming(train, counts)
-        self._pulses.arm(train, counts, lambda there: self._stand_at(there, stops))
+        self._set_up(train, counts, stops)
 
     def disarm(self) -> None:
         """Legal in every state. The output is put at rest."""
-        self._pulses.disarm()
+        if self._touched and self.limits.trigger_output:
+            for command in self._settings.quiet:
+                self._axis.ask(command)
+            self._train, self._touched = None, False
 
     def describe(self) -> dict[str, str | int | float]:
-        pulses, flags = self._pulses.settings, meaning_of(self._axis.flags_at_opening)
+        settings, flags = self._settings, meaning_of(self._axis.flags_at_opening)
         return {
-            "model": f"Zaber device {self._identity.number}",
-            "serial": self._identity.serial,
-            "firmware": self._identity.firmware,
+            **self._identity,
             "port": self._url,
-            "device": self._settings.device,
-            "axis": self._settings.axis,
-            "trigger_output": f"digital output {pulses.output}",
-            "trigger_position": "encoder" if pulses.triggers.measured else "commanded",
-            "pulse_width_s": "half an interval" if pulses.width is None else pulses.milliseconds / 1000,
-            "pulse_active_high": int(pulses.active_high),
+            "device": settings.device,
+            "axis": settings.axis,
+            "trigger_output": f"digital output {settings.output}",
+            "trigger_position": "encoder" if settings.measured else "commanded",
+            "pulse_width_s": "half an interval" if settings.toggle else settings.milliseconds / 1000,
+            "pulse_active_high": int(settings.active_high),
             **found_at_opening("" if flags is None else flags.text, self._found.notice),
             **self._travel.described(),
         }
 
     def digital_output(self, number: int) -> StageOutput:
-        if number == self._pulses.settings.output:
+        if number == self._settings.output:
             raise DeviceRefused(self.name, f"output {number} gives the trigger pulses", state="Nothing was sent")
 
         def set_to(high: bool) -> None:
             self._axis.ask(f"io set do {number} {int(high)}")
 
         return StageOutput(
-            f"{self.name} output {number}", set_to, lambda: self._axis.ask(f"io get do {number}", "[01]").data == "1"
+            f"{self.name} output {number}",
+            set_to,
+            lambda: self._axis.ask(f"io get do {number}", "[01]") == "1",
         )
 
     def _release(self) -> None:
@@ -266,20 +201,56 @@ class ZaberStage(LineStage):
 
     def _forget_flags(self, status: ZaberAxisStatus) -> None:
         if status.flags:
-            self._axis.forget_flags()
+            self._axis.ask_axis("warnings clear")
         self._told = frozenset()
 
     def _send_stop(self, hard: bool) -> str:
         return self._axis.stop("estop" if hard else "stop")
 
-    def _stand_at(self, counts: int, stops: int) -> None:
-        """Turn there and wait, unless a stop came meanwhile."""
-        way = abs(self.to_angle(counts - self._axis.standing("arming").counts))
-        self._start_move(self.to_angle(counts), self.limits.max_speed, stops)
-        self.wait(2 * way / self.limits.max_speed + STANDING_IN_PLACE)
+    def _set_up(self, train: TriggerTrain, counts: int, stops: int) -> None:
+        """Set the triggers up with the stage at `counts`, and enable the first one.
+
+        Args:
+            stops: number of stops before; a later one wins.
+        """
+        (*commands, enable), stand = set_up(self._settings, train, counts)
+        self._train, self._touched = None, True
+        try:
+            for command in commands:
+                self._axis.ask(command)
+            if stand != counts:
+                way = abs(self.to_angle(stand - counts)) / self.limits.max_speed
+                self._start_move(self.to_angle(stand), self.limits.max_speed, stops)
+                self.wait(2 * way + STANDING_IN_PLACE)
+            self._axis.ask(enable)
+        except DeviceRefused as problem:
+            raise problem.told_by(
+                self.name,
+                f"the triggers cannot be set up: {problem.problem}",
+                advice=ADVICE,
+                state="This train is not armed",
+            ) from problem
+        self._train = train
+
+    def _before_move(self, counts: int, target: int) -> None:
+        """Keep a train correct before a move from `counts` against it, because distance counts both ways.
+
+        A train under way ends. A train before its first pulse is set up anew, or ends if the stage had to move for it.
+        """
+        train, settings = self._train, self._settings
+        if train is None or train.interval * (target - counts) >= 0:
+            return
+        needed = max(settings.starter, settings.repeater)  # `d` (disabled), `e` or the fires left, of each trigger
+        states = self._axis.ask("trigger show", rf"(?:[de]|\d+)(?: (?:[de]|\d+)){{{needed - 1},}}").split()
+        if settings.chained and states[settings.starter - 1] != "d":
+            return
+        if settings.chained and states[settings.repeater - 1] == str(settings.fires * train.n):
+            self._set_up(train, counts, self._stops.count)
+        else:
+            self.disarm()
 
     def _check_turn_and_travel(self) -> None:
-        own = self._axis.cycle()
+        own = self._axis.get_if_known("limit.cycle.dist", self._settings.axis)
         if own is None or float(own) != self.limits.counts_per_turn:
             raise DeviceRefused(
                 self.name,
@@ -288,4 +259,5 @@ class ZaberStage(LineStage):
                 advice="Correct counts_per_turn, or check device and axis",
                 state="Nothing has moved",
             )
-        self._travel.refuse_narrower(*self._axis.travel(), advice="widen the controller's limits")
+        low, high = (int(self._axis.ask_axis(f"get limit.{end}", WHOLE)) for end in ("min", "max"))
+        self._travel.refuse_narrower(low, high, advice="widen the controller's limits")

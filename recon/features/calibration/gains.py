@@ -169,7 +169,7 @@ class _Band:
         return np.asarray(np.average(np.square(left[:, rows], dtype=np.float64), axis=(1, 2), weights=known))
 
     def _told_apart(self) -> F32:
-        """1 [col] where a gain is no body on the axis, which stays in a column."""
+        """Weights [col]: 1 where a gain cannot be mistaken for a body on the axis, which stays in a column."""
         off = np.abs(np.arange(self.data.shape[2]) - self.geometry.axis_col)
         still = np.ptp(self.geometry.shifts[:, 0]) < 2 * NEAR_AXIS
         return np.asarray((off > NEAR_AXIS) | (not still), np.float32)

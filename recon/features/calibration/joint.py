@@ -88,7 +88,7 @@ def knowable(shifts: F64, angles: F64) -> tuple[F64, float]:
 
 
 def slopes(images: F32, geometry: Geometry, tilted: F32 | None, terms: frozenset[str]) -> dict[str, F32]:
-    """The derivative of images [view, col, row] by each quantity: a pixel; an image's half extent at its edge.
+    """The derivative of images [view, col, row] by each quantity, per step of a pixel (of angles: at an image's edge).
 
     Args:
         tilted: the derivative by tilt, a radian; None: not wanted.
@@ -116,7 +116,7 @@ def edge_motion(geometry: Geometry) -> float:
 
 
 def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: float) -> Geometry:
-    """The geometry after steps along `slopes`, limited to so many pixels; what nobody can know is left out."""
+    """The geometry after steps along `slopes`, of at most `farthest` pixels; what nobody can know is left out."""
     limited = {name: np.clip(step, -farthest, farthest) for name, step in steps.items()}
     shifts, axis = geometry.shifts.copy(), geometry.axis_col
     if "col" in limited:

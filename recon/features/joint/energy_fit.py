@@ -102,7 +102,7 @@ class EnergyViews:
 
 
 def trial_rows(views: EnergyViews, grid: Grid, height: int) -> tuple[slice, Grid]:
-    """The rows with most matter, so many of them, for trials, and their slices; all if rows do not show slices."""
+    """The rows with most matter, for trials, and their slices; all rows if rows do not show slices."""
     if not views.geometry.rows_show_slices:
         return slice(None), grid
     rows = busiest_rows(views.projections, height)
@@ -271,7 +271,7 @@ class EnergyFit:
 
 
 def fitted(fit: EnergyFit, weights: F64, sweeps: int, go_on: Callable[[int, float], bool]) -> tuple[F32, float]:
-    """Densities and residual after so many sweeps, or when `go_on` ends them."""
+    """Densities and residual after `sweeps` sweeps, or when `go_on` ends them."""
     residual = 1.0
     for sweep, residual in enumerate(fit.sweeps(weights, sweeps), 1):
         if not go_on(sweep, residual):

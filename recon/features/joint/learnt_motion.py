@@ -35,7 +35,7 @@ _BLOCKS, _ONE_BLOCK_IN = 32, 4  # of the scan's time, and one of so many held ou
 
 
 def levels(cols: int) -> list[tuple[int, int]]:
-    """Voxel size in pixels, and number of turns, of each resolution level for so many pixels across."""
+    """Voxel size in pixels, and number of turns, of each resolution level for `cols` pixels across."""
     last = 1 if cols <= _FINE else 2
     widths = [last]
     while cols // (2 * widths[0]) >= _COARSEST:

@@ -44,7 +44,7 @@ class Motion:
 
     @classmethod
     def none(cls, shape: tuple[int, int, int], times: F64, knots: int, controls: int) -> Motion:
-        """No motion, with so many knots in time and control points along each axis."""
+        """No motion, with `knots` knots in time, and `controls` control points along each axis."""
         return cls(shape, times, np.zeros((knots, 3, *(min(controls, n) for n in shape))))
 
     def on(self, shape: tuple[int, int, int], times: F64) -> Motion:
@@ -78,7 +78,7 @@ class Motion:
 
 
 def _spline(at: F64, knots: int) -> F64:
-    """Natural cubic splines through so many even knots in 0 ... 1, [place, knot]; straight lines for two, 1 for one."""
+    """Natural cubic splines through `knots` even knots in 0 ... 1, [place, knot]; straight lines for two, 1 for one."""
     if knots == 1:
         return np.ones((at.size, 1))
     even = np.linspace(0, 1, knots)

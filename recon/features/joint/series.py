@@ -181,7 +181,7 @@ def _refuse_gaps(times: F64, knots: F64) -> None:
         raise ValueError(
             f"volume {k + 1} of {knots.size}, at time {knots[k]:g}, has {near[k]} views within "
             f"{np.diff(knots)[0] / 2:g}, expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views "
-            "before and after a gap apart"
+            "before and after a gap separately"
         )
 
 
@@ -207,7 +207,7 @@ def _moves(still: F64, moved: F64) -> bool:
 
 
 def _as_factors(made: TimedVolumes, fit: EnergyFit, smooth: float, go_on: Callable[[int, float], bool]) -> TimedVolumes:
-    """The volumes as factors of their mean, so smooth; unchanged where the steps to them are ended."""
+    """The volumes as smooth factors of their mean; unchanged if a stop ends the steps to them."""
     stop, problem = fit.stop, _of_factors(fit.views, made.volumes, made.grid, fit.stop)
     steps = Countdown(lambda after: go_on(-after, made.residual), SOLUTION_STEPS)
     factors = problem.solved(smooth, problem.ones(), steps)
@@ -260,7 +260,7 @@ def smooth_factors(
 
 
 def refuse_few(knots: int, n: int) -> None:
-    """Raise ValueError if so many views are too few for so many volumes."""
+    """Raise ValueError if `n` views are too few for `knots` volumes."""
     if not 2 <= knots <= n // LEAST_VIEWS:
         raise ValueError(
             f"{knots} volumes of {n} views: expected 2 volumes or more, and {LEAST_VIEWS} views or more for each"
@@ -268,7 +268,7 @@ def refuse_few(knots: int, n: int) -> None:
 
 
 def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F64]:
-    """The views as of so many moments at most, of equal numbers of views; and the moments within the scan, 0 ... 1."""
+    """The views in at most `most` moments of equally many views, and these moments within the scan, 0 ... 1."""
     n = views.geometry.n_views
     moments = min(most, n)
     moment = np.empty(n, np.intp)

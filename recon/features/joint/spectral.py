@@ -142,7 +142,7 @@ class _Trials:
         self._go_on, self._stop = go_on, stop
 
     def residual(self, weights: F64, after: int) -> float:
-        """Residual of the views held out, infinite if the trial was ended; `after` it so many trials may follow."""
+        """Residual of the views held out, infinite if the trial was stopped; `after`: trials that may still follow."""
         n = self._sweeps
         for sweep, residual in enumerate(self._fit.sweeps(weights, n), 1):
             if not self._go_on(sweep - n * (1 + after), residual):
@@ -168,7 +168,7 @@ class _Trials:
         return best
 
     def heaviest(self, weights: F64, factor: F64, rungs: int, after: int) -> F64:
-        """The heaviest weights, times powers of the factor, that predict as well; `weights` if ended."""
+        """The heaviest weights, in powers of the factor, that predict as well as the best; `weights` if stopped."""
         ladder = [weights * factor**octave for octave in range(rungs)]
         residuals = [self.residual(rung, after + rungs - 1 - n) for n, rung in enumerate(ladder) if self.going]
         if not self.going:

@@ -8,6 +8,8 @@ from beamline.config import load as config
 from drivers.stages.pm16c.stage import PM16CStage
 from drivers.stages.zaber.stage import ZaberStage
 
+pytestmark = pytest.mark.usefixtures("simulated_zaber")
+
 SIMULATED = str(config.config_folder() / "simulated.yaml")
 FAST = ("--set", "simulation.clock=virtual")
 FIGURES = "counts_per_turn: 360000, max_speed_deg_s: 30, acceleration_deg_s2: 60"

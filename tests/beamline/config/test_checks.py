@@ -8,6 +8,8 @@ from beamline.config import load as config
 from beamline.core.errors import ConfigError
 from tests.beamline.config_file import GOOD, faults, load, write
 
+pytestmark = pytest.mark.usefixtures("simulated_zaber")
+
 
 @pytest.mark.parametrize(
     ("old", "new", "said"),

@@ -96,8 +96,13 @@ FAULTS = {
         "my.yaml:7: devices.stage.axis is not a known key; legal keys there: kind, port",
     ),
     "counterpart of another stage": (
-        ("kind: pm16c", "kind: zaber"),
-        "my.yaml:7: devices.stage: port sim://pm16c is not the simulated counterpart of zaber, sim://zaber",
+        ("kind: pm16c", "kind: pi_gcs"),
+        "my.yaml:7: devices.stage: port sim://pm16c is not the simulated counterpart of pi_gcs, sim://pi_gcs",
+    ),
+    "a stage without a simulated controller": (
+        ('kind: pm16c, port: "sim://pm16c"', 'kind: zaber, port: "sim://zaber"'),
+        "my.yaml:7: devices.stage: a zaber stage has no simulated controller, so sim://zaber is none of its ports; "
+        "simulate a stage with kind: pi_gcs, port: sim://pi_gcs, or set its real port and rehearse with --rehearse",
     ),
     "an output that the PM16C has not": (
         ("shutter: {kind: simulated}", "shutter: {kind: stage_output, output: 2}"),

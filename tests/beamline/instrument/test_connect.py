@@ -23,6 +23,8 @@ from drivers.orca_quest import DcamOptions
 from tests.beamline.ball_scan import STAGES, shipped, small
 from tests.beamline.closable import Closable
 
+pytestmark = pytest.mark.usefixtures("simulated_zaber")
+
 
 @pytest.mark.parametrize(
     ("name", "stage"), [("simulated", "pm16c"), ("demo", "pm16c"), ("demo", "pi_gcs"), ("demo", "zaber")]

@@ -23,6 +23,8 @@ from simulators.frame.shot import Detector
 from simulators.scenes.scene import load_scene
 from tests.beamline.ball_scan import BALL, COMMON, STAGES, fly, shipped, small
 
+pytestmark = pytest.mark.usefixtures("simulated_zaber")
+
 
 def _seen(block: Block) -> NDArray[np.float64]:
     """Angles in the middle of the exposures of 50 ms, which begin at the pulses: a scene without blur shows these."""

@@ -11,6 +11,8 @@ from beamline.scan.preflight import dry_run
 from drivers.base.errors import DeviceRefused
 from tests.beamline.ball_scan import COMMON, STAGES, small
 
+pytestmark = pytest.mark.usefixtures("simulated_zaber")
+
 
 @pytest.mark.parametrize("kind", ["pi_gcs", "zaber"])
 def test_a_shutter_never_sits_on_the_trigger_output(kind: str) -> None:

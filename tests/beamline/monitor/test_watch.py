@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from beamline.monitor import watch as scan
-from beamline.monitor.check import Flag, Level, Look, ScanContext
+from beamline.monitor.check import CheckResult, Flag, Level, ScanContext
 from beamline.monitor.digest import digest
 from beamline.monitor.frames import StuckCheck, TimingCheck
 from drivers.base.frame import Frame, FrameKind
@@ -55,8 +55,8 @@ class Early:
     def start(self) -> None:
         return None
 
-    def look(self, state: None, frame: Frame, digest: Any, context: ScanContext) -> Look[None]:
-        return Look(state, Flag(self.name, Level.WARN, frame.index, 1.0, 0.0, "", first=frame.index - 3))
+    def look(self, state: None, frame: Frame, digest: Any, context: ScanContext) -> CheckResult[None]:
+        return CheckResult(state, Flag(self.name, Level.WARN, frame.index, 1.0, 0.0, "", first=frame.index - 3))
 
 
 def test_a_finding_reaches_back_to_the_first_of_the_frames_of_its_kind(fake: Any) -> None:

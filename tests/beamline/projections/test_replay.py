@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from beamline.core.errors import DataError
-from beamline.monitor.check import Flag, Level, Look
+from beamline.monitor.check import CheckResult, Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.digest import digest
 from beamline.monitor.frames import SaturationCheck
@@ -171,13 +171,13 @@ def test_flags_are_gathered_by_check_and_level() -> None:
 
 
 class Fails(SaturationCheck):
-    """A check of another package, which returns what is no `Look` from one frame on."""
+    """A check of another package, which returns what is no `CheckResult` from one frame on."""
 
     name = "fails"
     bit = 40
 
     def look(self, state: Any, frame: Frame, digest: Any, context: Any) -> Any:
-        return Look(state) if frame.index < 6 else None
+        return CheckResult(state) if frame.index < 6 else None
 
 
 def test_a_check_that_fails_is_off_and_named_and_the_others_go_on() -> None:
@@ -189,5 +189,5 @@ def test_a_check_that_fails_is_off_and_named_and_the_others_go_on() -> None:
     assert beside.kinds == alone.kinds and alone.alarmed == (20,)
     assert [text for text in beside.aside if text not in alone.aside] == [
         "the check fails failed at frame 6 and is off, the other checks go on: "
-        "TypeError('it returned None; expected a Look with a Flag or None')"
+        "TypeError('it returned None; expected a CheckResult with a Flag or None')"
     ]

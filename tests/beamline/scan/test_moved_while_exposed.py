@@ -26,6 +26,8 @@ from drivers.base.protocols import Camera
 from simulators.wires.wire import plugged
 from tests.beamline.ball_scan import COMMON, STAGES, small
 
+pytestmark = pytest.mark.usefixtures("simulated_zaber")
+
 KINDS = {name: STAGES[name] for name in ("pm16c", "pi_gcs", "zaber")} | {
     "epics": f"{{kind: epics, port: 'sim://epics', {COMMON}}}"
 }

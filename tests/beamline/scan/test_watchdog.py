@@ -29,6 +29,7 @@ from tests.clock import wait_until
 from tests.drivers.soft_ioc import PREFIX, TickingClock, record_of, serve_pva
 from tests.simulators.wires.transports import serve_tcp
 
+pytestmark = pytest.mark.usefixtures("simulated_zaber")
 FREEZES = (("zaber", "scan"),) if os.name == "posix" else ()
 OTHERS = (("pi_gcs", ""), ("pm16c", ""), *FREEZES)
 STAGES = {"pi_gcs": "axis: A, trigger_line: 1", "zaber": "output: 1", "pm16c": "channel: 3"}

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import BeamlineError, exit_code
 from beamline.core.stop import ScanAborted, StopRequest
-from beamline.monitor.check import Flag, Level, Look
+from beamline.monitor.check import CheckResult, Flag, Level
 from beamline.monitor.field import MassCheck
 from beamline.scan import recorder
 from beamline.storage.readers.open import open_scan
@@ -31,13 +31,13 @@ ERRORS: tuple[Callable[[], BaseException], ...] = (
 )  # fmt: skip
 
 
-def _odd(**fields: Any) -> Look[int]:
-    return Look(0, replace(Flag("mass", Level.WARN, 0, 1.0, 1.0, "Look."), **fields))
+def _odd(**fields: Any) -> CheckResult[int]:
+    return CheckResult(0, replace(Flag("mass", Level.WARN, 0, 1.0, 1.0, "Look."), **fields))
 
 
 ANSWERS: tuple[Any, ...] = (
     None, "fine", Flag,
-    Look(0, "a flag"),  # type: ignore[arg-type]
+    CheckResult(0, "a flag"),  # type: ignore[arg-type]
     _odd(level="bad"), _odd(check="another"), _odd(frame=99), _odd(frame=-1),
     _odd(frame="0"), _odd(first=5), _odd(score="high"), _odd(advice=None), _odd(region=(1, 2)),
     _odd(region="all"),

@@ -39,9 +39,9 @@ from simulators.devices.trigger_line import Pulse, TriggerLine
 from simulators.wires.pi_gcs.wire import PiGcsBuild, PiGcsController
 from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
 from simulators.wires.wire import register
-from simulators.wires.zaber.wire import ZaberBuild, ZaberController
 from tests.drivers.dcam.fake import World
 from tests.drivers.stages.flat_settings import flat
+from tests.simulators.wires.zaber.wire import ZaberBuild, ZaberController
 
 COUNTS = 360_000
 SENSOR = (16, 16)

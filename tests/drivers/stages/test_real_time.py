@@ -25,11 +25,11 @@ from simulators.devices.clock import ScaledClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pm16c.wire import PM16CBuild, PM16CController
 from simulators.wires.wire import Wire, register
-from simulators.wires.zaber.wire import ZaberBuild, ZaberController
 from tests.drivers import zaber_rig
 from tests.drivers.stages import pi_gcs_rig
 from tests.drivers.stages.flat_settings import flat
 from tests.simulators.wires.transports import serve_pty, serve_tcp
+from tests.simulators.wires.zaber.wire import ZaberBuild, ZaberController
 
 FAST = math.radians(60)
 SOON = 10.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from beamline.monitor.check import Flag, Level, Look, Policy, ScanContext
+from beamline.monitor.check import CheckResult, Flag, Level, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame
 
@@ -24,8 +24,10 @@ class Half:
     def start(self) -> float:
         return 0.0
 
-    def look(self, state: float, frame: Frame, digest: FrameDigest, context: ScanContext) -> Look[float]:
+    def look(self, state: float, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[float]:
         light = float(frame.counts.mean())
         if light >= self.share * state:
-            return Look(max(state, light))
-        return Look(state, Flag(self.name, Level.WARN, frame.index, light / state, self.share, "Look at the shutter."))
+            return CheckResult(max(state, light))
+        return CheckResult(
+            state, Flag(self.name, Level.WARN, frame.index, light / state, self.share, "Look at the shutter.")
+        )

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from drivers.stages.zaber.settings import ZaberSettings
-from drivers.stages.zaber.stage import ZaberStage
+from drivers.stages.pi_gcs.settings import PiGcsSettings
+from drivers.stages.pi_gcs.stage import PiGcsStage
 from recon.base.setting import setting
 
 
 @dataclass(frozen=True)
-class SiteStageSettings(ZaberSettings):
-    """The site's stage: a Zaber with a brake."""
+class SiteStageSettings(PiGcsSettings):
+    """The site's stage: a PI with a brake."""
 
     brake: float = setting(0.1, "How long its brake takes.", unit="s", ge=0)
 
 
-class SiteStage(ZaberStage):
+class SiteStage(PiGcsStage):
     Settings = SiteStageSettings

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from simulators.wires.zaber.wire import ZaberBuild
+from simulators.wires.pi_gcs.wire import PiGcsBuild
 
 
-class SiteBuild(ZaberBuild):
+class SiteBuild(PiGcsBuild):
     """Its simulated controller."""

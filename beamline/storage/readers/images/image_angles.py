@@ -68,7 +68,7 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
 
 
 def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[re.Match[str]], bool]:
-    """The number of each name that may be its angle, fewer than names where some have none; and whether by a word."""
+    """The number in each name that may be its angle (fewer if some have none), and whether a word marks it."""
     worded = [[number for number in row if number["word"] or number["unit"]] for row in numbers]
     if any(worded):
         return [row[0] for row in worded if len(row) == 1], True
@@ -146,7 +146,7 @@ def _separates(chosen: list[re.Match[str]], before: list[str], *, zero: bool) ->
 
 
 def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
-    """Why what stands beside the points of the numbers, or beside the numbers, may be no decimals, or some."""
+    """Why the digits beside a point, or beside the number, may or may not be decimals; "" if that is clear."""
     parts, wholes = [each["part"] or "" for each in chosen], [each["whole"] for each in chosen]
     if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
         return "one side of their point or comma counts the images"

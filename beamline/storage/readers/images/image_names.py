@@ -191,7 +191,7 @@ def _template(name: str, doubt: str = "") -> str:
 
 
 def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
-    """The number of each image, wherever it stands in the name; None where no number is another in each name.
+    """The number of each image, wherever it stands in the name; None if no number differs from name to name.
 
     Of several that are, the one that counts most closely; others, such as a date, may only go along with it.
     """

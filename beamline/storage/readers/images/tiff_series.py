@@ -154,7 +154,7 @@ class TiffSeriesSource(ScanSource):
         return (self.path / name).stat().st_size if self._zip is None else self._zip.getinfo(name).file_size
 
     def _opened(self, name: str, most: int) -> IO[bytes]:
-        """A file of the series, of so many bytes at most."""
+        """A file of the series, of at most `most` bytes."""
         if (n := self._size(name)) > most:
             raise OSError(errno.EFBIG, f"it has {size(n)}, and at most {size(most)} are read")
         if self._zip is not None and is_blank(n, self._zip.getinfo(name).compress_size, n):
@@ -215,7 +215,7 @@ class TiffSeriesSource(ScanSource):
             raise UnreadableError(f"{name} in {self.path} cannot be read as an image (it contains none).")
         if len(shape) != 2:
             raise DataError(
-                f"{name} in {self.path} is {shape}; expected one grey image a file. Give stacks as FILE --then FILE."
+                f"{name} in {self.path} is {shape}; expected one grey image a file. Give stacks as FILE --append FILE."
             )
         require_real(dtype, f"{name} in {self.path}")
         return shape

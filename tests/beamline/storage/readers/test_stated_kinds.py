@@ -104,7 +104,7 @@ def test_a_scan_in_several_files_is_read_as_one(tmp_path: Path) -> None:
         assert source.table.part_starts.tolist() == [0]  # no file is a part that should have flats of its own
     with pytest.raises(DataError, match=r"gone\.nxs does not exist"):
         open_scan(SourceOptions(paths[0], then=(tmp_path / "gone.nxs",)))
-    with pytest.raises(DataError, match="cannot be followed with --then"):
+    with pytest.raises(DataError, match="cannot be followed with --append"):
         open_scan(SourceOptions(paths[0], then=(paths[1],)), follow=True)
 
 

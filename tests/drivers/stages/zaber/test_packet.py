@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.stages.zaber.packet import ENDINGS, FAULTS, damage, encode, lrc, meaning_of, reply_form, reply_of
-from simulators.wires.zaber.wire import frame
+from drivers.stages.zaber.packet import ENDINGS, FAULTS, Reply, damage, encode, lrc, meaning_of, reply_form
 from tests.drivers.zaber_vectors import VECTORS
+from tests.simulators.wires.zaber.wire import frame
 
 COMMANDS = [
     ("/1 0 01 trigger 1 when 1 dist 1000:C1", (1, 0, 1, "trigger 1 when 1 dist 1000")),
@@ -31,12 +31,6 @@ def test_checksums_are_the_published_ones(packet: str) -> None:
 @pytest.mark.parametrize(("packet", "command"), COMMANDS)
 def test_commands_are_those_of_the_vendors_library(packet: str, command: tuple[int, int, int, str]) -> None:
     assert encode(*command) == packet
-
-
-@pytest.mark.parametrize("words", ["x" * 70, "a:b", "a\nb", "a#b", "a\\", "Grad°"])
-def test_what_does_not_go_into_a_packet_is_refused(words: str) -> None:
-    with pytest.raises(ValueError):
-        encode(1, 1, 0, words)
 
 
 @pytest.mark.parametrize("line", ["@01 1 OK IDLE -- 0:8C", "@01 0 RJ IDLE -- BADCOMMAND:F5", "!01 1 IDLE --:96"])
@@ -62,7 +56,7 @@ def test_junk_is_judged_without_a_fuss(text: str) -> None:
     for line in (text, "@" + text, "@01 1 07 OK " + text):
         assert isinstance(damage(line, must_have_checksum=True), str)
         match = re.fullmatch(reply_form(1, 1, 7, r"-?\d+"), line)
-        assert match is None or reply_of(match).raw == line
+        assert match is None or Reply.of(match).raw == line
 
 
 @given(
@@ -76,7 +70,7 @@ def test_a_reply_that_a_device_frames_is_read_back(
     assert damage(line, must_have_checksum=True) == ""
     match = re.fullmatch(reply_form(device, axis, identity, r"-?\d+"), line)
     assert match is not None
-    reply = reply_of(match)
+    reply = Reply.of(match)
     assert (reply.accepted, reply.busy, reply.flag, reply.data) == (True, busy, flag.strip("-"), "-42")
     assert re.fullmatch(reply_form(device, axis, (identity + 1) % 100, r"-?\d+"), line) is None
     assert re.fullmatch(reply_form(device, axis, identity, "[a-z]+"), line) is None

@@ -14,9 +14,9 @@ from drivers.base.protocols import RotationStage
 from drivers.stages.zaber.settings import ZaberSettings
 from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.wire import register
-from simulators.wires.zaber.wire import Fault
 from tests.drivers.stages.rig import NAMES
 from tests.drivers.zaber_rig import REPLIES_TO_OPEN, Rig
+from tests.simulators.wires.zaber.wire import Fault
 
 
 @pytest.fixture

@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
-from drivers.stages.zaber.settings import PulseSettings, TriggerUse, ZaberSettings, remaining, set_up
+from drivers.stages.zaber.settings import ZaberSettings, set_up
 from drivers.testing.stages.bench import LONG, SPEED, StageBench
-from tests.drivers.stages.flat_settings import flat
 from tests.drivers.zaber_rig import Rig
 
 
@@ -29,82 +28,77 @@ def points(train: TriggerTrain) -> list[int]:
 # what is sent
 
 
+USUAL = ZaberSettings(counts_per_turn=360_000, max_speed=1.0, acceleration=1.0)
+
+
 def test_the_starter_stands_one_step_before_and_enables_the_repeater() -> None:
-    setup = set_up(PulseSettings(output=3), TriggerTrain(5000, 200, 37), axis=1, counts=0)
-    assert setup.commands == (
-        "trigger 1 disable",
-        "trigger 2 disable",
-        "io set do 3 0",
-        "trigger 2 when 1 dist 200",
-        "trigger 2 action a io set do 3 1 schedule 1 0",
-        "trigger 2 action b none",
-        "trigger 1 when 1 pos >= 4800",
-        "trigger 1 action a none",
-        "trigger 1 action b trigger 2 enable 37",
+    assert set_up(replace(USUAL, output=3), TriggerTrain(5000, 200, 37), counts=0) == (
+        (
+            "trigger 1 disable",
+            "trigger 2 disable",
+            "io set do 3 0",
+            "trigger 2 when 1 dist 200",
+            "trigger 2 action a io set do 3 1 schedule 1 0",
+            "trigger 2 action b none",
+            "trigger 1 when 1 pos >= 4800",
+            "trigger 1 action a none",
+            "trigger 1 action b trigger 2 enable 37",
+            "trigger 1 enable 1",
+        ),
+        0,
     )
-    assert (setup.enable, setup.stand) == ("trigger 1 enable 1", None)
 
 
 def test_within_the_last_step_the_starter_gives_the_first_pulse() -> None:
-    settings = PulseSettings(width=None, triggers=TriggerUse(measured=True, starter=4, repeater=6))
-    setup = set_up(settings, TriggerTrain(-500, -200, 3), axis=2, counts=-450)
-    assert setup.commands[3:] == (
+    settings = replace(USUAL, toggle=True, measured=True, starter=4, repeater=6, axis=2)
+    commands, _ = set_up(settings, TriggerTrain(-500, -200, 3), counts=-450)
+    assert commands[3:] == (
         "trigger 6 when 2 encoder dist 100",
         "trigger 6 action a io set do 1 t",
         "trigger 6 action b none",
         "trigger 4 when 2 encoder.pos <= -500",
         "trigger 4 action a io set do 1 t",
         "trigger 4 action b trigger 6 enable 5",
+        "trigger 4 enable 1",
     )
 
 
-@pytest.mark.parametrize(
-    ("settings", "shown", "left"),
-    [
-        (PulseSettings(), "1 d d d d d", 5),
-        (PulseSettings(), "d 5 d d d d", 5),
-        (PulseSettings(), "d 2 d d d d", 2),
-        (PulseSettings(), "d d", 0),
-        (PulseSettings(width=None), "d 10", 5),
-        (PulseSettings(width=None), "d 9", 4),
-        (PulseSettings(width=None), "d 1", 0),
-        (PulseSettings(triggers=TriggerUse(chained=False)), "d 4", 4),
-    ],
-)
-def test_pulses_to_come_from_what_the_controller_shows(settings: PulseSettings, shown: str, left: int) -> None:
-    assert remaining(settings, TriggerTrain(100, 10, 5), shown) == left
-
-
-def test_a_controller_with_fewer_triggers_is_noticed() -> None:
-    with pytest.raises(ValueError, match="trigger 2"):
-        remaining(PulseSettings(), TriggerTrain(100, 10, 5), "d")
+def test_an_unchained_train_is_armed_one_step_before_its_first_pulse() -> None:
+    commands, stand = set_up(replace(USUAL, chained=False), TriggerTrain(5000, 200, 37), counts=4900)
+    assert (commands[-2:], stand) == (("trigger 2 action b none", "trigger 2 enable 37"), 4800)
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"width": 0.0},
-        {"width": 0.0015},
-        {"width": math.nan},
+        {"pulse_width": 0.0},
+        {"pulse_width": 0.0015},
+        {"pulse_width": math.nan},
         {"starter": 2},
         {"chained": False, "fires_when_enabled": True},
+        {"toggle": True, "pulse_width": 4e-3},
     ],
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError):
-        flat(PulseSettings, **wrong)
+        replace(USUAL, **wrong)
 
 
-def test_what_is_chosen_of_an_output_goes_with_the_rest() -> None:
-    triggers = TriggerUse(chained=False, shortest=2e-3)
-    usual = ZaberSettings(counts_per_turn=360_000, max_speed=1.0, acceleration=1.0, chained=False, shortest=2e-3)
-    falling = replace(usual, output=3, active_high=False)
-    assert replace(falling.pulses, triggers=triggers) == PulseSettings(3, 1e-3, False, triggers)
-    assert replace(usual, pulse_width=4e-3).pulses.spacing == 8e-3
-    toggled = replace(usual, toggle=True).pulses
-    assert (toggled.width, toggled.spacing) == (None, 4e-3)
-    with pytest.raises(ValueError, match="no pulse width"):
-        replace(usual, toggle=True, pulse_width=4e-3)
+def test_how_far_pulses_are_apart_at_full_speed() -> None:
+    slow = replace(USUAL, shortest=2.5e-3)
+    spaced = {
+        "usual": USUAL,
+        "slow": slow,
+        "wide": replace(slow, pulse_width=4e-3),
+        "toggled": replace(slow, toggle=True),
+    }
+    assert {name: settings.limits().pulse_spacing for name, settings in spaced.items()} == {
+        "usual": 2e-3,
+        "slow": 2.5e-3,
+        "wide": 8e-3,
+        "toggled": 5e-3,
+    }
+    assert [settings.limits().interval_unit for settings in spaced.values()] == [1, 1, 1, 2]
 
 
 # what comes of it

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.zaber.triggers import Triggers
-from simulators.wires.zaber.wire import Command, Fault, PacketReader, ZaberBuild, frame, lrc
 from tests.drivers.stages.flat_settings import flat
 from tests.drivers.zaber_vectors import VECTORS
-from tests.simulators.zaber_host import SPEED, TURN, Wire
+from tests.simulators.wires.zaber.host import SPEED, TURN, Wire
+from tests.simulators.wires.zaber.triggers import Triggers
+from tests.simulators.wires.zaber.wire import Command, Fault, PacketReader, ZaberBuild, frame, lrc
 
 
 @pytest.fixture
@@ -128,14 +128,6 @@ def test_pulses_wider_than_their_distance_in_time_merge(wire: Wire) -> None:
     set_up(wire, "1 dist 500", "io set do 1 1 schedule 60 0")
     wire.run("move abs 90000")
     assert len(wire.pulses()) < 90
-
-
-def test_lost_pulses_are_missing_and_no_others() -> None:
-    wire = Wire(lost={1, 4})
-    set_up(wire, "1 dist 500")
-    wire.run("move abs 2000")
-    wire.run("move abs 4000")
-    assert wire.counts() == [500, 1500, 2000, 3000, 3500, 4000]
 
 
 def test_predicted_edges_happen() -> None:
@@ -304,10 +296,6 @@ def test_faults_befall_the_replies_that_they_are_set_for() -> None:
         Fault.OTHER_ID: "@01 1 42 OK IDLE -- 0:06\r\n",
         Fault.AGAIN: "@01 1 7 RJ IDLE -- AGAIN:03\r\n",
     }
-
-
-def test_an_echoing_line_sends_the_command_back_first() -> None:
-    assert Wire(echo=True).tell("/1 1 get pos").endswith("/1 1 get pos\n@01 1 OK IDLE -- 0\r\n")
 
 
 class Passing(VirtualClock):

@@ -108,7 +108,7 @@ def test_a_file_of_an_ome_set_has_its_own_pages_alone(tmp_path: Path, stack: NDA
             np.testing.assert_array_equal(source.read(slice(None)), stack)
             assert source.not_used == ()
     else:
-        with pytest.raises(DataError, match=r"s_0\.ome\.tif in .* is \(2, 6, 8\).*FILE --then FILE"):
+        with pytest.raises(DataError, match=r"s_0\.ome\.tif in .* is \(2, 6, 8\).*FILE --append FILE"):
             open_scan(tmp_path)
 
 

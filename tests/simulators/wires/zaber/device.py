@@ -6,13 +6,13 @@ A controller with one rotary axis, X-RSW style. It rejects unknown commands with
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence, Set
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from drivers.base.clock import Clock
 from simulators.devices.trigger_line import Pulse, TriggerLine
-from simulators.wires.zaber.axis import Rejected, SimulatedZaberAxis, ZaberAxisBuild
-from simulators.wires.zaber.triggers import ACTIONS, OUTPUTS, TRIGGERS, Edge, Triggers, is_output, number_in
+from tests.simulators.wires.zaber.axis import Rejected, SimulatedZaberAxis, ZaberAxisBuild
+from tests.simulators.wires.zaber.triggers import ACTIONS, OUTPUTS, TRIGGERS, Edge, Triggers, is_output, number_in
 
 LOOK_AHEAD = 10.0  # s beyond the end of a move for which edges are predicted
 WRITABLE = {"maxspeed", "motion.accelonly", "motion.decelonly", "limit.min", "limit.max"}
@@ -31,7 +31,6 @@ class DeviceBuild:
         identity: the name of the setting with the device's identity number: "device.id" or "deviceid".
         latency: s from a trigger's condition to its actions.
         fires_when_enabled: a distance trigger fires where it is enabled, too.
-        lost: trigger pulses (from 0, since power-on) that never reach the line.
     """
 
     output: int = 1
@@ -42,7 +41,6 @@ class DeviceBuild:
     identity: str = "device.id"
     latency: float = 0.0
     fires_when_enabled: bool = False
-    lost: Set[int] = frozenset()
     axis: ZaberAxisBuild = field(default=ZaberAxisBuild())
 
 
@@ -52,37 +50,24 @@ class ZaberDevice:
     def __init__(self, clock: Clock, line: TriggerLine, build: DeviceBuild) -> None:
         now, counts_per_turn = clock.now(), build.axis.counts_per_turn
         self.axis = SimulatedZaberAxis(now, build.axis)
+        self.axis.settings["limit.cycle.dist"] = counts_per_turn
         self.triggers = Triggers(self.axis.move, build.latency, build.fires_when_enabled, now)
         self.alerts, self.checksums = False, False
-        self._clock, self._line, self._lost = clock, line, build.lost
+        self._clock, self._line = clock, line
         self._output, self._active = build.output - 1, int(build.active_high)
         self.triggers.outputs[self._output] = 1 - self._active
         self._can_schedule, self._can_chain = build.can_schedule, build.can_chain
         self._has_triggers = tuple(map(int, build.firmware.split("."))) >= (7, 6)
         self._angle_of_count = 2 * math.pi / counts_per_turn
         self._sent: set[Pulse] = set()
-        self._looked, self._counted = 0, 0  # past edges that were processed, and the pulses among them
+        self._looked = 0  # past edges that were processed
         self._fixed: dict[str, str] = {
             build.identity: "50952",
             "system.serial": "123456",
             "version": build.firmware,
-            "version.build": "1",
-            "system.axiscount": "1",
-            "device.hw.modified": "0",
             "comm.address": "1",
-            "comm.packet.size.max": "80",
-            "comm.word.size.max": "50",
-            "comm.command.packets.max": "2",
-            "get.settings.max": "10",
             "trigger.numtriggers": str(TRIGGERS),
             "trigger.numactions": str(ACTIONS),
-        }
-        self._fixed_of_axis: dict[str, str] = {
-            "limit.cycle.dist": str(counts_per_turn),
-            "resolution": "64",
-            "peripheralid": "0",
-            "peripheral.id": "0",
-            "peripheral.hw.modified": "0",
         }
 
     def settle(self) -> bool:
@@ -138,10 +123,6 @@ class ZaberDevice:
             setting = "motion.accelonly"
         if setting in self.axis.settings:
             return str(self.axis.settings[setting])
-        if setting == "driver.enabled":
-            return str(int(self.axis.enabled))
-        if setting in self._fixed_of_axis:
-            return self._fixed_of_axis[setting]
         raise Rejected("BADCOMMAND")
 
     def _change(self, axis: int, words: Sequence[str]) -> None:
@@ -217,14 +198,13 @@ class ZaberDevice:
         happened = self._happened()
         coming = self.triggers.predicted(max(now, self.axis.move.end) + LOOK_AHEAD)
         self._line.cancel_after(now)
-        self._emit(now, happened + self._pulses(coming, self._counted))
+        self._emit(now, happened + self._pulses(coming))
 
     def _happened(self) -> list[Pulse]:
         """Pulses since the last call."""
         new = self.triggers.edges[self._looked :]
-        pulses, self._looked = self._pulses(new, self._counted), self._looked + len(new)
-        self._counted += sum(map(self._is_pulse, new))
-        return pulses
+        self._looked += len(new)
+        return self._pulses(new)
 
     def _emit(self, now: float, pulses: list[Pulse]) -> None:
         """Put pulses on the line, without the past ones that it already has."""
@@ -232,15 +212,13 @@ class ZaberDevice:
             self._line.schedule(new)
             self._sent.update(new)
 
-    def _pulses(self, edges: Sequence[Edge], first: int) -> list[Pulse]:
-        """The pulses that are not lost; the first pulse has the number `first` since power-on."""
-        active = enumerate(filter(self._is_pulse, edges), first)
+    def _pulses(self, edges: Sequence[Edge]) -> list[Pulse]:
+        active = self._output, self._active
         return [
-            Pulse(edge.time, edge.position * self._angle_of_count) for index, edge in active if index not in self._lost
+            Pulse(edge.time, edge.position * self._angle_of_count)
+            for edge in edges
+            if (edge.channel, edge.value) == active
         ]
-
-    def _is_pulse(self, edge: Edge) -> bool:
-        return (edge.channel, edge.value) == (self._output, self._active)
 
 
 def _whole(text: str) -> int:

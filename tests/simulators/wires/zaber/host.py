@@ -8,8 +8,8 @@ from typing import Any
 from drivers.testing.stages.bench import EmittedPulse, emitted
 from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.zaber.wire import ZaberBuild
 from tests.drivers.stages.flat_settings import flat
+from tests.simulators.wires.zaber.wire import ZaberBuild
 
 TURN = 360_000
 SPEED = 10_000

@@ -11,9 +11,9 @@ from recon.assess.metrics import psnr
 from recon.base.method import ReconProblem, RunControl
 from recon.base.view_data import Views
 from recon.splatting.anytime import PredictionErrors, direct_volume, volume_error
-from recon.splatting.in_time import LastRound
 from recon.splatting.r2 import R2
 from recon.splatting.stream import StreamingFit
+from recon.splatting.time_limit import FinalFit
 from recon.voxels.projector import Projector
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
@@ -76,7 +76,7 @@ def test_the_errors_along_all_views_are_the_error_of_the_volume() -> None:
 @pytest.mark.parametrize(("steps", "direct"), others_slow([(0.05, True), (12, False)]))
 def test_the_better_of_the_fit_and_fbp_is_shown(data: np.ndarray, steps: float, views: int, direct: bool) -> None:
     fit = _grown(data, steps, views)
-    shown, of_fit = fit.shown(), fit.snapshot()
+    shown, of_fit = fit.best_preview(), fit.snapshot()
     by_fbp = direct_volume(list(data[:views]), VIEWS.select(range(views)), GRID)
     assert shown.direct == direct == (psnr(TRUTH, by_fbp) > psnr(TRUTH, of_fit.data))
     np.testing.assert_allclose(shown.volume.data, by_fbp if direct else of_fit.data, atol=1e-4)
@@ -96,7 +96,7 @@ def test_the_end_is_the_same_however_long_the_fit_had_to_wait(data: np.ndarray) 
 
     def quality(steps: float) -> float:
         fit = _grown(data, steps)
-        last = LastRound(fit, R2(), 1e9, 0.0)
+        last = FinalFit(fit, R2(), 1e9, 0.0)
         made = last.run(ReconProblem(Views(data, VIEWS), GRID), RunControl(now=SteppedClock(tick=1e-3)))
         assert made.history[-1].step == made.history[-1].steps
         return psnr(TRUTH, made.volume.data)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from simulators.devices.motion import TrapezoidMove
-from simulators.wires.zaber.axis import Rejected
+from tests.simulators.wires.zaber.axis import Rejected
 
 OUTPUTS, TRIGGERS, ACTIONS = 4, 6, 2
 UNLIMITED = -1

@@ -12,9 +12,9 @@ import pytest
 
 from drivers.base.clock import SystemClock
 from simulators.devices.trigger_line import TriggerLine
-from simulators.wires.zaber.wire import ZaberBuild, ZaberController
 from tests.drivers.stages.flat_settings import flat
 from tests.simulators.wires.transports import serve_tcp
+from tests.simulators.wires.zaber.wire import ZaberBuild, ZaberController
 
 pytest.importorskip("zaber_motion", reason="the vendor's library is not installed: pip install '.[oracle]'")
 

@@ -17,9 +17,9 @@ from drivers.base.clock import Clock
 from drivers.stages.zaber.settings import ZaberSettings
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.wire import BytesWire
-from simulators.wires.zaber.axis import Rejected, ZaberAxisBuild
-from simulators.wires.zaber.device import NOTHING, DeviceBuild, ZaberDevice
-from simulators.wires.zaber.triggers import OUTPUTS
+from tests.simulators.wires.zaber.axis import Rejected, ZaberAxisBuild
+from tests.simulators.wires.zaber.device import NOTHING, DeviceBuild, ZaberDevice
+from tests.simulators.wires.zaber.triggers import OUTPUTS
 
 LONGEST_PACKET = 80  # Bytes of a packet; a longer one is ignored
 LONGEST_WORD = 50
@@ -119,13 +119,11 @@ class ZaberBuild:
     Attributes:
         address: of the device in the chain.
         faults: reply (from 0, since power-on) -> what happens to it.
-        echo: the line sends the host its own bytes back.
         device: the device behind the wire.
     """
 
     address: int = 1
     faults: Mapping[int, Fault] = field(default_factory=dict)
-    echo: bool = False
     device: DeviceBuild = field(default=DeviceBuild())
 
     @classmethod
@@ -159,13 +157,11 @@ class ZaberController(BytesWire):
         super().__init__(clock)
         self.replies = 0
         self.device = ZaberDevice(clock, line, build.device)
-        self._address, self._echo, self._faults = build.address, build.echo, build.faults
+        self._address, self._faults = build.address, build.faults
         self._reader = PacketReader()
         self._turns(line, self.device.axis.angle_at)
 
     def _take(self, data: bytes) -> None:
-        if self._echo:
-            self._send(data)
         for packet in self._reader.feed(data):
             self._settle()
             command = packet.command if isinstance(packet, Malformed) else packet

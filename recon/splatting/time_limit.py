@@ -106,7 +106,7 @@ def planned_finish(method: Fit, remaining: float, steps: float, problem: ReconPr
 
 
 @dataclass(frozen=True, eq=False)
-class LastRound(Iterative):
+class FinalFit(Iterative):
     """The last round of a fit, over the views that it was already fitted to, and the sweeps after it.
 
     Attributes:

@@ -12,7 +12,7 @@ from recon import R2, Geometry, Grid, RunControl
 from recon.base.decisions import Decisions
 from recon.base.method import ReconProblem
 from recon.base.view_data import Views
-from recon.splatting.in_time import FinishPlan, finish_within, planned_finish
+from recon.splatting.time_limit import FinishPlan, finish_within, planned_finish
 from recon.voxels.projector import Projector
 from tests.clock import SteppedClock
 
@@ -48,7 +48,7 @@ def test_sweeps_that_are_given_keep_their_whole_share_of_the_seconds(monkeypatch
     views = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (6, 40))
     problem = ReconProblem(Views(np.zeros((24, 6, 40), np.float32), views), Grid.matching(views))
     for found, given, planned in ((3, 20, (20, 80.0)), (0, 20, (0, 0.2)), (3, None, (3, 0.2))):
-        monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, found=found: FinishPlan(found, 0.2))
+        monkeypatch.setattr("recon.splatting.time_limit.finish_within", lambda *_, found=found: FinishPlan(found, 0.2))
         plan = planned_finish(R2(finish=given), 100.0, 10.0, problem, SteppedClock(tick=1.0))
         assert (plan.sweeps, plan.seconds) == planned
 
@@ -84,7 +84,7 @@ def test_slabs_make_as_many_sweeps_as_the_first_one_decided(
     """Seconds do not suffice for the same finish in every slab; another one would show as a seam."""
     decided = Decisions().made
     for found in (3, 0):
-        monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, found=found: FinishPlan(found, 0.3))
+        monkeypatch.setattr("recon.splatting.time_limit.finish_within", lambda *_, found=found: FinishPlan(found, 0.3))
         control = RunControl(now=SteppedClock(tick=1e-3), decide=(decide := Decisions(followed=decided)))
         done = recon.reconstruct(*parallel, R2(seconds=0.4, gaussians=50), control=control)
         assert done.settings["finish"] == 3
@@ -95,7 +95,7 @@ def test_a_finish_without_time_for_trials_has_the_weight_by_the_noise(
     parallel: tuple[np.ndarray, Geometry], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for trials in (True, False):
-        monkeypatch.setattr("recon.splatting.in_time.finish_within", lambda *_, t=trials: FinishPlan(2, 0.3, t))
+        monkeypatch.setattr("recon.splatting.time_limit.finish_within", lambda *_, t=trials: FinishPlan(2, 0.3, t))
         control = RunControl(now=SteppedClock(tick=1e-3), decide=Decisions(), stop_trials=lambda: True)
         done = recon.reconstruct(*parallel, R2(seconds=0.4, gaussians=50), control=control)
         assert done.settings["finish"] == 2 and control.decide is not None

@@ -1,3 +1,0 @@
-"""Simulated Zaber device."""
-
-CONTROLLERS = {"zaber": "ZaberBuild"}
