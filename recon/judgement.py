@@ -9,6 +9,7 @@ from enum import Flag, auto
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from recon.assess import metrics
 from recon.base.arrays import F32
@@ -148,8 +149,15 @@ def contrast(reference: Volume, volumes: Mapping[str, Volume], seed: int) -> dic
 
     Regions of each volume itself would be others. Empty if the reference has no such regions.
     """
-    regions = metrics.interior_regions(metrics.sampled(reference.data), seed)
-    if regions is None:
-        return {}
-    figures = {name: metrics.snr_cnr(metrics.sampled(each.data), regions) for name, each in volumes.items()}
-    return {name: {"snr": snr, "cnr": cnr} for name, (snr, cnr) in figures.items()}
+    regions = regions_of(reference, seed)
+    return {} if regions is None else {name: contrast_in(regions, each) for name, each in volumes.items()}
+
+
+def regions_of(reference: Volume, seed: int) -> NDArray[np.int8] | None:
+    """Dense and empty regions for `contrast_in`; None if the reference has no such regions."""
+    return metrics.interior_regions(metrics.sampled(reference.data), seed)
+
+
+def contrast_in(regions: NDArray[np.int8], volume: Volume) -> dict[str, float]:
+    """SNR and CNR of a volume in the regions of a reference."""
+    return dict(zip(("snr", "cnr"), metrics.snr_cnr(metrics.sampled(volume.data), regions), strict=True))

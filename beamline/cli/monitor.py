@@ -120,6 +120,7 @@ def _watched(
     from beamline.projections.replay import replay, verdict
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.open import SourceOptions
+    from beamline.storage.rules.evidence import ScanEvidence
     from beamline.storage.rules.scan import scan_ended
 
     progress, follow = counting("monitor", sink, clock), clock if request.follow else None
@@ -137,7 +138,7 @@ def _watched(
                     sink(FrameFlagged(flag, time=clock.now()))
             active = now
         summed = verdict(source, frames, limits)
-        ended = [finding.message for finding in scan_ended(source)]
+        ended = [finding.message for finding in scan_ended(ScanEvidence(source))]
         if request.sheet is not None:
             from beamline.reconstruct.scan_facts import worst_frames
 

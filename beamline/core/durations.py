@@ -1,10 +1,12 @@
-"""Durations: the time that is left, and the phases of a long work."""
+"""Durations: the time that is left, the rows of a table in turn, and the phases of a long work."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
 
-from beamline.core.events import PhaseReached, Sink
+from beamline.core.events import PhaseReached, Sink, TrialReached
 from drivers.base.clock import Clock, SystemClock
 
 
@@ -16,6 +18,20 @@ def seconds_left(done: float, total: float, spent: float) -> float | None:
         spent: s for what is done.
     """
     return max(total - done, 0.0) * spent / done if done > 0 and spent > 0 else None
+
+
+_Row = TypeVar("_Row")
+
+
+def in_turn(stage: str, rows: Sequence[_Row], label: Callable[[_Row], str], sink: Sink, clock: Clock) -> Iterator[_Row]:
+    """The rows of a table that are to be worked on; an event `progress` of this stage before each, with its label, the
+    rate so far and the seconds left."""
+    begin = clock.now()
+    for n, row in enumerate(rows):
+        spent = clock.now() - begin
+        eta, rate = seconds_left(n, len(rows), spent), 60 * n / max(spent, 1e-9)
+        sink(TrialReached(stage, n, len(rows), label(row), eta, rate, time=clock.now()))
+        yield row
 
 
 _SAY_EVERY = 0.2  # s between events on the progress of a phase

@@ -12,13 +12,14 @@ import stat
 import time
 import uuid
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, TextIO
 
 from beamline.core.errors import DataError
+from beamline.core.text import csv_text
 
 PART = "part-{}"  # The folder of a later part of a scan that was resumed, in that of the run
 OURS = 0o755  # Mode of a run's folder: only the owner may replace files there, whatever the umask
@@ -327,6 +328,17 @@ def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> N
         bring_to_disk(partial)
         if partial.read_bytes() != data:
             raise OSError(errno.EIO, "what is read back is not what was written")
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, object]], names: Sequence[str] = ()) -> None:
+    """Write rows of values by name as a CSV file in place of an earlier one, see `text.csv_text`.
+
+    Args:
+        names: of the columns; empty: those of the first row.
+    """
+    columns = names or list(rows[0])
+    text = csv_text([columns, *([row[name] for name in columns] for row in rows)])
+    write_whole(path, text.encode("utf-8", "surrogateescape"), replace=True)
 
 
 def write_together(writes: Iterable[tuple[Path, Callable[[Path], object]]]) -> None:

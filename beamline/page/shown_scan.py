@@ -15,8 +15,9 @@ from beamline.page.tiles import TileRegion, lit
 from beamline.page.volume import ShownVolume, VolumeTile
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.resampling import TiltAndLens
-from beamline.projections.selection import Selection, cone_of, geometry_of
+from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.volumes.base import bare_record
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -144,7 +145,7 @@ class ShownScan:
         self._read(row, tilt_deg)
         every = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
         data, angles = self._lines[::every], self._source.table.angles[self._ids[::every]]
-        geometry = geometry_of(self._source, Selection(rows=(self._band.start, self._band.stop)), axis_col, angles)
+        geometry = Selection(rows=(self._band.start, self._band.stop)).of(self._source).geometry(axis_col, angles)
         whole = Grid.matching(geometry)
         cols, voxel, height = self._source.shape[1], whole.voxel_size, 0.0
         n = cols if abs(axis_col - (cols - 1) / 2) < _NEAR * cols else whole.shape[1]  # else it jumps with each column
@@ -179,7 +180,7 @@ class ShownScan:
 
     @property
     def _cone(self) -> tuple[float, float] | None:
-        return cone_of(self._source, Selection())
+        return self._source.cone
 
     def _read(self, row: int, tilt_deg: float) -> None:
         """Correct the rows that a slice needs, which are kept for the next slices."""
@@ -201,7 +202,9 @@ class ShownScan:
         some = spread_views(self._source.table.angles[frames], _VIEWS, frames)
         band = range(max(near, 0), min(far + 1, rows))
         try:
-            self._correction = self._correction or ScanCorrection(self._source, Selection(), lambda _: None)
+            self._correction = self._correction or ScanCorrection(
+                ScanEvidence(self._source), Selection().of(self._source), lambda _: None, some
+            )
             corrected = self._correction.at_once(some, slice(band.start, band.stop))
         except ValueError as error:
             raise DataError(f"The views cannot be corrected: {error}.") from error
@@ -212,7 +215,7 @@ class ShownScan:
         """The row [view, col] of views that are turned by the tilt, linear between pixels."""
         if not tilt_deg:
             return data[:, row - self._band.start]
-        turned = TiltAndLens(tilt_deg).of(self._source, Selection())
+        turned = TiltAndLens(tilt_deg).of(self._source, Selection().of(self._source))
         assert turned is not None
         (rows,), (cols,) = turned.places((1, data.shape[2]), row)
         rows, cols = np.clip(rows - self._band.start, 0, data.shape[1] - 1), np.clip(cols, 0, data.shape[2] - 1)

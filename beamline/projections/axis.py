@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
-from beamline.projections.correction import ScanCorrection
-from beamline.projections.corrections.poses import poses_of, stated_poses
-from beamline.projections.selection import Selection, check_axis, cone_of, geometry_of, rows_of, unbinned
+from beamline.projections.correction import ScanCorrection, line_integrals_of
+from beamline.projections.corrections.poses import ScanPoses
+from beamline.projections.selection import ScanSelection, check_axis, unbinned
 from beamline.projections.usable_views import UsableViews, longest_part
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.axis_held_out import COLS, VIEWS, axis_by_views
 from recon.base.geometry import Geometry
 from recon.base.masks import areas
@@ -34,31 +35,35 @@ _GUESSED = 0.01  # of the mass in filled pixels moves the centre of mass by at m
 
 
 def rotation_axis(
-    source: ScanSource,
-    selection: Selection,
+    scan: ScanEvidence,
+    selection: ScanSelection,
     correction: ScanCorrection,
     usable: UsableViews,
+    poses: ScanPoses | None,
     warn: Warn,
     progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate | None]:
     """The rotation axis in columns of the full detector, and how it was found (None if the user gave it).
 
+    With `poses`, opposite views are no mirror images.
+
     Raises:
         DataError: no axis explains the views.
         ConfigError: it lies outside the detector.
     """
-    axis_col, axis = selection.axis_col, None
-    if (stated := poses_of(source, selection, usable.frames)) is not None and stated.vectors is not None:
-        return stated.axis_col, None
-    posed = stated_poses(source, selection) is not None  # opposite views are then no mirror images
-    if axis_col is None and (posed or cone_of(source, selection) is not None):
-        axis_col, axis = _axis_by_views(source, selection, usable, warn, progress)
+    if poses is not None and poses.vectors is not None:
+        return poses.axis_col, None
+    source, axis = scan.source, None
+    axis_col = selection.axis_col
+    straight = poses is None and selection.cone is None
+    if axis_col is None and not straight:
+        axis_col, axis = _axis_by_views(scan, selection, usable.frames, poses, warn, progress)
     elif axis_col is None:
-        whole = selection.axis_rows
-        by = correction if whole is None else ScanCorrection(source, replace(selection, rows=whole), lambda _: None)
+        by = correction
+        if selection.axis_rows is not None:
+            by = ScanCorrection(scan, replace(selection, rows=selection.axis_rows), lambda _: None, usable.frames)
         axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
     check_axis(source, axis_col)
-    straight = not posed and cone_of(source, selection) is None
     if selection.axis_col is not None and straight and usable.frames.size >= _FEWEST:
         _compare_with_views(source, axis_col, correction, usable.frames, warn)
     return axis_col, axis
@@ -80,24 +85,28 @@ def _compare_with_views(
 
 
 def _axis_by_views(
-    source: ScanSource, selection: Selection, usable: UsableViews, warn: Warn, progress: Callable[[int, int], None]
+    scan: ScanEvidence,
+    selection: ScanSelection,
+    frames: NDArray[np.int64],
+    poses: ScanPoses | None,
+    warn: Warn,
+    progress: Callable[[int, int], None],
 ) -> tuple[float, AxisEstimate | None]:
     """The axis by views held out. What the file states stays, unless they agree better with another one."""
-    stated, cols = source.axis_col, source.shape[1]
+    source, stated, cols = scan.source, scan.source.axis_col, scan.source.shape[1]
     if selection.axis_rows is not None:
         selection = replace(selection, rows=selection.axis_rows)
-    rows = rows_of(source, selection)
+    rows = selection.detector_rows
     # Few rows would leave columns fine, for which volumes take minutes: rows beside them are read, too.
     height = max(rows.stop - rows.start, min(cols // COLS, source.shape[0]))
     first = min(max((rows.start + rows.stop - height) // 2, 0), source.shape[0] - height)
     binning = max(selection.binning, min(cols // COLS, height))
     coarse = replace(selection, binning=binning, rows=(first, first + height))
-    poses, frames = poses_of(source, coarse, usable.frames), usable.frames
     if poses is not None:
-        frames = frames[poses.stated(frames)]
-    views = ScanCorrection(source, coarse, lambda _: None).at_once(spread(frames, VIEWS))
+        poses, frames = replace(poses, pivot=coarse.pivot, binning=binning), frames[poses.stated(frames)]
+    views = line_integrals_of(scan, coarse, spread(frames, VIEWS))
     begin = (cols - 1) / 2 if stated is None else stated
-    geometry = geometry_of(source, coarse, begin, source.table.angles[views.view_ids])
+    geometry = coarse.geometry(begin, source.table.angles[views.view_ids])
     if poses is not None:
         geometry = poses.corrected(geometry, views.view_ids)
     try:

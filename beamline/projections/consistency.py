@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import Selection
+from beamline.projections.selection import ScanSelection
 from beamline.projections.tilt import MATTERS, tilt_text
 from beamline.projections.views import refuse
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import WARN, light_beside_flats
-from beamline.storage.rules.references import groups_taken, reference_groups
 from recon.base.arrays import F32, F64, median_deviation
 from recon.base.geometry import Geometry
 from recon.base.noise import NOISE_VIEWS, noise_level
@@ -82,7 +80,7 @@ class Law:
         return f"{self.residual:.3g} {self.unit} (tolerance {self.tolerance:.3g})"
 
 
-def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, warn: Warn) -> dict[str, str]:
+def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelection, warn: Warn) -> dict[str, str]:
     """Warn of consistency conditions that the views violate; returns the residual of each in words, by name.
 
     Angles, heights, turned frames, masses and an axis that moments of the views disagree with, which hold for a
@@ -97,7 +95,7 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: Selection, w
     known = prepared.measured is None and prepared.projections.floored <= _FLOORED
     if geometry.shifts.any() or not geometry.is_straight or whole.size < _LEAST_VIEWS or not known:
         return {}
-    laws = _laws_of(prepared, whole=selection.rows is None)
+    laws = _laws_of(prepared, whole=selection.asked.rows is None)
     for law in laws:
         if law.broken:
             warn(law.sentence)
@@ -141,7 +139,7 @@ def _laws_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]
 
 
 def compare_with_flats(
-    source: ScanSource, selection: Selection, projections: Projections, warn: Warn, *, refused: bool = True
+    scan: ScanEvidence, selection: ScanSelection, projections: Projections, warn: Warn, *, refused: bool = True
 ) -> dict[str, str]:
     """Warn of views whose light does not match their flats; returns in words how bright their air is relative to the
     flats.
@@ -152,13 +150,9 @@ def compare_with_flats(
     Raises:
         DataError: such a difference, and the references are checked.
     """
-    if source.quantity != "counts" or not len(projections.data):
+    if scan.beam is None or not len(projections.data):
         return {}
-    accepted = selection.step(Preparation).accepted
     said = selection.step(Air).model != "auto"  # columns that are said to be air
-    groups = groups_taken(source) if accepted else reference_groups(source)
-    if not (groups.darks and groups.flats):
-        return {}
     if any(projections.air_columns):
         level = -float(np.log(np.median(projections.air)))
     else:
@@ -168,8 +162,8 @@ def compare_with_flats(
         ]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
-    for finding in light_beside_flats(source, groups, level, air, accepted or said or not refused):
-        refuse(source, [finding])
+    for finding in light_beside_flats(scan, level, air, scan.asked.accepted or said or not refused):
+        refuse(scan.source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}
 

@@ -20,19 +20,23 @@ from beamline.projections.corrections.references import (
     with_dynamic_flats,
 )
 from beamline.projections.read import read_binned, spoilt_frames, tell_damaged
-from beamline.projections.selection import Selection
+from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import ReferenceGroups, groups_taken, reference_groups, views_differ
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
 from recon.base.views import spread
-from recon.prep.correct import Correction, CorrectionSettings, References
+from recon.prep.correct import CorrectionSettings, LinesPlan, References, survey
 from recon.prep.counts import Photons, photon_transfer
 from recon.prep.references import SHADOW_REACH, shadowed
 from recon.prep.unmeasured import foreign_rows
 
 _LEAST_VIEWS, SHADOW_VIEWS, _BAND = 8, 16, 64  # for a shadow: views at least and at most, and rows at a time
+
+# bool [row, col], objects in the beam of all views; bool [row], rows in which objects come and go that are not of the
+# sample (`foreign_rows`).
+Shadow = tuple[Mask, Mask]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +49,6 @@ class OpenBeam:
         photons: how pixels count photons; None: logarithms are taken.
         light: float64 [frame], by how much that of a view grows to the usual exposure and, where it is asked for, the
             median ring current; None: all views are alike.
-        n_references: darks and flats that the file had.
-        used: those that are used.
         done: what flats, defects and noise came to, by these names.
     """
 
@@ -54,17 +56,14 @@ class OpenBeam:
     settings: CorrectionSettings
     photons: Photons | None
     light: NDArray[np.float64] | None
-    n_references: int
-    used: ReferenceGroups
     done: dict[str, StepDone]
 
     @classmethod
-    def of(cls, source: ScanSource, selection: Selection, read: slice, rows: slice, warn: Warn) -> OpenBeam:
+    def of(cls, scan: ScanEvidence, selection: ScanSelection, read: slice, warn: Warn) -> OpenBeam:
         """The open beam from the reference frames in the file; a faulty group is used only if there is no other.
 
         Args:
             read: detector rows that are read.
-            rows: those of them that are wanted.
             warn: takes a sentence on damaged frames, on spots, and on parts of the scan without flats.
 
         Raises:
@@ -72,15 +71,14 @@ class OpenBeam:
             DataError: references that cannot be used.
         """
         asked = selection.step(Preparation)
-        alike = not (asked.by_current or views_differ(source))
-        light, n = None if alike else light_scale(source, asked.by_current), count_references(source)
-        used = groups_taken(source) if asked.accepted else reference_groups(source)
-        references = read_references(source, used, read, selection, warn)
+        alike = not (asked.by_current or scan.views_differ)
+        light = None if alike else light_scale(scan, asked.by_current)
+        references = read_references(scan, read, selection, warn)
         if asked.flat_fields == "dynamic":
-            references = with_dynamic_flats(source, used, references, read, selection)
-        tell_damaged(source, selection, np.concatenate([*used.darks, *used.flats]), warn)
-        warn_of_parts_without_flats(source, references, warn)
-        photons = photons_of(source, used, references, rows, selection)
+            references = with_dynamic_flats(scan, references, read, selection)
+        tell_damaged(scan.source, selection, np.concatenate([*scan.used.darks, *scan.used.flats]), warn)
+        warn_of_parts_without_flats(scan, references, warn)
+        photons = photons_of(scan, references, selection)
         settings = CorrectionSettings(
             asked.floor,
             asked.hot_threshold,
@@ -88,7 +86,7 @@ class OpenBeam:
             selection.step(Air).columns,
             selection.step(Air).sample_from,
         )
-        flats, noise = flats_sentence(source, references, asked.by_current), noise_sentence(references, photons)
+        flats, noise = flats_sentence(scan, references, asked.by_current), noise_sentence(references, photons)
         recorded = {name: value if isinstance(value, float) else str(value) for name, value in asdict(settings).items()}
         del recorded["sample_from"]  # follows from --air
         done = {
@@ -96,29 +94,10 @@ class OpenBeam:
             "flats": StepDone(flats, {"flats": flats or asked.flat_fields}),
             "noise": StepDone(noise, {"noise": noise or "logarithms of counts"}),
         }
-        return cls(references, settings, photons, light, n, used, done)
+        return cls(references, settings, photons, light, done)
 
-    def correction(self, rows: slice, shadow: tuple[Mask, Mask] | None) -> Correction:
-        """The correction for some of the rows read, binned.
-
-        Args:
-            shadow: of all rows read, see `shadow`; None: nothing.
-
-        Raises:
-            ValueError: references that cannot be used.
-        """
-        references, settings = self.references.rows(rows), self.settings
-        standing, foreign = (None, None) if shadow is None else (part[rows] for part in shadow)
-        plain = Correction(references, settings, None, self.photons, foreign)
-        if standing is None or not standing.any():
-            return plain
-        return Correction(references, settings, plain.masked | standing, self.photons, foreign)
-
-    def shadow(
-        self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int
-    ) -> tuple[Mask, Mask] | None:
-        """bool [row, col], objects in the beam of all views, and bool [row], rows in which objects come and go that are
-        not of the sample (`foreign_rows`), judged from some of these; None if they are too few to tell.
+    def shadow(self, source: ScanSource, views: NDArray[np.int64], first: int, binning: int) -> Shadow | None:
+        """What stands in the beam of all views, judged from some of these; None if they are too few to tell.
 
         Args:
             first: the detector row at which the rows read begin.
@@ -133,24 +112,27 @@ class OpenBeam:
             rows = slice(max(0, start - SHADOW_REACH), min(len(in_shadow), start + _BAND + SHADOW_REACH))
             read = slice(first + rows.start * binning, first + rows.stop * binning)
             data = np.nan_to_num(read_binned(source, views, read, binning))
-            light = Correction(references.rows(rows), settings).transmission(data, views.astype(np.float64)).data
+            light = survey(references.rows(rows), settings).transmission(data, views.astype(np.float64), views).data
             in_shadow[start : start + _BAND] = shadowed(light, settings.floor)[start - rows.start :][:_BAND]
             foreign[rows] |= foreign_rows(light, source.table.angles[views])
         return np.zeros_like(in_shadow) if in_shadow.all() else in_shadow, foreign
 
 
-def count_references(source: ScanSource) -> int:
-    """Numbers of darks and flats in the file so far."""
-    return source.table.darks.size + source.table.flats.size
+def foreign_to_lines(source: ScanSource, views: NDArray[np.int64], read: slice, binning: int) -> Shadow | None:
+    """As `OpenBeam.shadow`, of line integrals, in which nothing tells what stands there in all views."""
+    if views.size < SHADOW_VIEWS:
+        return None
+    some = spread(views, SHADOW_VIEWS)
+    lines = LinesPlan.of(np.inf).transmission(read_binned(source, some, read, binning), some.astype(np.float64), some)
+    foreign = foreign_rows(np.exp(-lines.data), source.table.angles[some])
+    return np.zeros(lines.data.shape[1:], np.bool_), foreign
 
 
 _PHOTONS = 1e-3, 1e12  # in a pixel of the open beam, far beyond any detector's on either side
 _TRANSFER_FRAMES, _TRANSFER_ROWS = 16, 64  # more do not sharpen the gain, they only cost reading
 
 
-def photons_of(
-    source: ScanSource, used: ReferenceGroups, references: References, rows: slice, selection: Selection
-) -> Photons | None:
+def photons_of(scan: ScanEvidence, references: References, selection: ScanSelection) -> Photons | None:
     """Photon statistics of the (binned) pixels of a scan; None if logarithms are to be taken.
 
     The gain is that of the selection, or the photon transfer of the largest group of flats. The readout noise is that
@@ -163,13 +145,13 @@ def photons_of(
     model = selection.step(Preparation)
     if model.noise == "log":
         return None
-    binning = selection.binning
+    source, binning, rows = scan.source, selection.binning, selection.detector_rows
     first = rows.start + max(0, (rows.stop - rows.start - _TRANSFER_ROWS * binning) // 2 // binning * binning)
     middle = slice(first, min(first + _TRANSFER_ROWS * binning, rows.stop))
     spoilt = spoilt_frames(source, not model.uses_flags)
     flats, darks = (
         read_binned(source, np.setdiff1d(max(groups, key=len), spoilt)[:_TRANSFER_FRAMES], middle, binning)
-        for groups in (used.flats, used.darks)
+        for groups in (scan.used.flats, scan.used.darks)
     )
     if model.gain is not None:  # a mean of n pixels has n times as many photons a count
         light = _counts_of_light(references) * binning**2 / model.gain

@@ -14,25 +14,25 @@ from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.projections.axis import rotation_axis
 from beamline.projections.consistency import compare_with_flats, warn_of_inconsistency
-from beamline.projections.correction import NoViewError, ScanCorrection
+from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import EstimatedStep, ScanStep
-from beamline.projections.read import ViewFilters
+from beamline.projections.read import NoViewError, ViewFilters
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.scan_warnings import (
     report_defects,
-    warn_of_joined_views,
     warn_of_other_axis,
     warn_of_the_field,
     warn_of_units,
 )
-from beamline.projections.selection import Selection, choose_views, cone_of, pixel_size, rows_of
+from beamline.projections.selection import ScanSelection, Selection, choose_views
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, checked_views
+from beamline.projections.views import ViewGeometry, asked_of, checked_views, evidence_of
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
@@ -84,17 +84,19 @@ def prepare_projections(
     """
     phases = phases or Phases()
     phases.enter("flags and references")
-    usable, poses, wide = _usable(source, selection, warn)
+    selection = selection.of(source)
+    scan = ScanEvidence(source, asked_of(source, selection))
+    usable, poses, wide = _usable(scan, selection, warn)
     phases.enter("tilt and references", "bands")
-    selection, sought = with_tilt(source, selection, usable.frames, warn, phases.progress)
-    correction = ScanCorrection(source, selection, warn)
-    if poses is None and selection.step(TiltAndLens).tilt is None and cone_of(source, selection) is None:
+    selection, sought = with_tilt(scan, selection, usable.frames, warn, phases.progress)
+    correction = ScanCorrection(scan, selection, warn, usable.frames)
+    if poses is None and selection.step(TiltAndLens).tilt is None and selection.cone is None:
         warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
-    axis_col, axis = rotation_axis(source, selection, correction, usable, warn, phases.progress)
-    warn_of_other_axis(source, selection, axis_col, warn)
+    axis_col, axis = rotation_axis(scan, selection, correction, usable, poses, warn, phases.progress)
+    warn_of_other_axis(poses, selection, axis_col, warn)
     phases.enter("jumps", "guesses")
-    view_geometry = ViewGeometry(source, selection, axis_col)
+    view_geometry = ViewGeometry(scan, selection, axis_col)
     usable = view_geometry.find_motion(usable, warn, phases)
     used, others = _chosen(view_geometry, usable, poses)
     view_geometry.calibrate(np.union1d(used, others), phases)
@@ -111,16 +113,16 @@ def prepare_projections(
         and (new := step.estimated(source, selection, projections, geometry)) is not None
     ]:
         selection = selection.with_steps(*estimated)
-        correction = ScanCorrection(source, selection, lambda _: None)  # its warnings were given
+        correction = ScanCorrection(scan, selection, lambda _: None, usable.frames)  # its warnings were given
         if any(step.on(source, selection)[0] is not None for step in estimated):
             projections = _corrected(source, correction, used, buffer, phases)
-    light = compare_with_flats(source, selection, projections, warn)
+    light = compare_with_flats(scan, selection, projections, warn)
     phases.enter("background, rings, views held out, hardening", "corrections")
     place = view_geometry.axis_col, axis
-    prepared = assemble(source, selection, projections, geometry, place, usable, warn, buffer is not None)
+    prepared = assemble(scan, selection, projections, geometry, place, usable, warn, buffer is not None)
     prepared = _with_held_out(prepared, correction, view_geometry, others)
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
-    prepared = replace(prepared, done={**correction.done, **tilt, **view_geometry.done})
+    prepared = replace(prepared, done={**correction.plan.done, **tilt, **view_geometry.done})
     prepared = _after_scan_steps(source, selection, prepared, phases)
     prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.ordinary, selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
@@ -145,20 +147,20 @@ def _with_held_out(
 
 def require_usable(source: ScanSource, selection: Selection) -> None:
     """Raise the errors of `prepare_projections` that can be found without reading a frame."""
-    _usable(source, selection, lambda sentence: None)
+    _usable(evidence_of(source, selection), selection.of(source), lambda sentence: None)
 
 
-def _usable(source: ScanSource, selection: Selection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
+def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
     """The usable views, their stated poses, and rows of wide views; refuses what is wrong before any frame is read."""
-    warn_of_joined_views(source, warn)
-    usable = checked_views(source, selection, warn)
+    source = scan.source
+    usable = checked_views(scan, selection, warn)
     warn_of_units(source, selection, warn)
     first = choose_views(source, usable.frames, selection)
     for step in geometry_steps(selection):
         step.refuse_few(first.size, usable.frames.size, source.shape[1] // selection.binning)
     poses = poses_of(source, selection, usable.frames)
     if poses is not None:
-        require_stated(poses, source, selection, usable.frames[first])
+        require_stated(poses, source, usable.frames[first])
         aside = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
         return replace(usable, frames=usable.frames[~aside]), poses, usable.frames[aside]
     return usable, poses, source.table.wide_views
@@ -168,11 +170,11 @@ def _chosen(
     view_geometry: ViewGeometry, usable: UsableViews, poses: ScanPoses | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows of the file of the views that are used, and of some others that are held out."""
-    source, selection, frames = view_geometry.source, view_geometry.selection, usable.frames
+    source, selection, frames = view_geometry.scan.source, view_geometry.selection, usable.frames
     chosen = choose_views(source, frames, selection, view_geometry.of(frames).period)
     used, rest = frames[chosen], np.delete(frames, chosen)
     if poses is not None:
-        require_stated(poses, source, selection, used)
+        require_stated(poses, source, used)
         rest = rest[poses.stated(rest)]
     return used, spread(rest, _HELD_OUT_VIEWS)
 
@@ -199,7 +201,7 @@ def _corrected(
 
 
 def _after_scan_steps(
-    source: ScanSource, selection: Selection, prepared: PreparedProjections, phases: Phases
+    source: ScanSource, selection: ScanSelection, prepared: PreparedProjections, phases: Phases
 ) -> PreparedProjections:
     """The views after the steps on all of them, which change line integrals in place."""
     done, steps = dict(prepared.done), [step for step in in_order(selection) if isinstance(step, ScanStep)]
@@ -229,8 +231,8 @@ def _with_unknown_filled(prepared: PreparedProjections) -> PreparedProjections:
 
 
 def assemble(
-    source: ScanSource,
-    selection: Selection,
+    scan: ScanEvidence,
+    selection: ScanSelection,
     projections: Projections,
     geometry: Geometry,
     axis: tuple[float, AxisEstimate | None],
@@ -249,7 +251,8 @@ def assemble(
     Raises:
         DataError: fewer than two views, or nothing in the beam.
     """
-    rows, (height, width) = rows_of(source, selection), geometry.detector_shape
+    source, (height, width) = scan.source, geometry.detector_shape
+    rows = selection.detector_rows
     binning, first = selection.binning, ViewFilters.of(source, selection).read(None).start
     ids = projections.view_ids
     if ids.size < 2:
@@ -274,7 +277,7 @@ def assemble(
         axis=estimate,
         held_out=None,
         n_projections=source.table.views.size,
-        length_unit="px" if pixel_size(source, selection) is None else "mm",
+        length_unit="px" if selection.pixel_size_mm is None else "mm",
         quantity=source.quantity,
         view_weights=usable.weights_of(ids),
         left_out=usable.left_out,
@@ -283,18 +286,11 @@ def assemble(
         measured=~unknown if unknown.any() else None,
         shares_of=shares_of if on_disk and regions.mark(ids) else None,
         stretch=_stretch(source, geometry, resampled=resampling is not None),
-        sample_radius=_stated_radius(source, selection),
+        sample_radius=None if selection.sample_width is None else selection.sample_width / 2,
     )
     report_defects(prepared, first, binning, warn)
-    warn_of_the_field(source, selection, prepared.ordinary, warn)
+    warn_of_the_field(scan, selection, prepared.ordinary, warn)
     return prepared
-
-
-def _stated_radius(source: ScanSource, selection: Selection) -> float | None:
-    """Half the width of the sample in mm (px where the pixel size is unknown), as asked for or as the file says."""
-    stated = source.attributes.get("sample_diameter_mm") if pixel_size(source, selection) is not None else None
-    width = stated if selection.sample_width is None else selection.sample_width
-    return None if width is None else float(width) / 2
 
 
 def _stretch(source: ScanSource, geometry: Geometry, *, resampled: bool) -> float:

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from beamline.projections.prepared import PreparedProjections
-    from beamline.projections.selection import Selection
+    from beamline.projections.selection import ScanSelection
     from beamline.projections.usable_views import UsableViews
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.geometry import Geometry
     from recon.prep.correct import Projections
 
@@ -33,7 +34,7 @@ class ScanPart:
     """
 
     source: ScanSource
-    selection: Selection
+    selection: ScanSelection
     geometry: Geometry
 
     def view_bytes(self, reach: int = 0) -> int:
@@ -77,7 +78,7 @@ class ViewFilter:
 class ViewStep(PrepStep, Protocol):
     """A step on each view alone, also of a scan that still runs."""
 
-    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
+    def on(self, source: ScanSource, selection: ScanSelection) -> tuple[ViewFilter | None, StepDone]:
         """The filter of a scan, None where nothing is to be done; and what it does.
 
         Raises:
@@ -90,7 +91,7 @@ class EstimatedStep(Protocol):
     """A step whose settings may be estimated from the corrected views of a finished scan."""
 
     def estimated(
-        self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry
+        self, source: ScanSource, selection: ScanSelection, views: Projections, geometry: Geometry
     ) -> ViewStep | None:
         """The step with the settings that these views, corrected without it, determine; None if they determine none."""
 
@@ -141,8 +142,8 @@ class PlaceStep(PrepStep, Protocol):
 
     def place(
         self,
-        source: ScanSource,
-        selection: Selection,
+        scan: ScanEvidence,
+        selection: ScanSelection,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
@@ -205,10 +206,10 @@ class GeometryStep(PrepStep, Protocol):
 
     def learn(
         self,
-        source: ScanSource,
-        selection: Selection,
+        scan: ScanEvidence,
+        selection: ScanSelection,
         frames: NDArray[np.int64],
-        geometry_before: Callable[[Selection, NDArray[np.int64]], Geometry],
+        geometry_before: Callable[[ScanSelection, NDArray[np.int64]], Geometry],
         progress: Callable[[int, int], None],
     ) -> GeometryLearnt:
         """The geometry of these frames, from views whose geometry is otherwise known.

@@ -1,26 +1,28 @@
-"""Reading: pixels of a scan, binned while they are read, which frames cannot be used, and the filters of views."""
+"""Reading: pixels of a scan, binned while they are read, and the views that cannot be used; the filters of views."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from beamline.core.sinks import Warn
 from beamline.core.text import count, spans
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ViewFilter, ViewStep
 from beamline.projections.registry import in_order
-from beamline.projections.selection import Selection, rows_of
+from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
+from beamline.projections.usable_views import gap_sentence
 from beamline.storage.datasets import HELD
 from beamline.storage.readers.base import ScanSource, read_known
-from recon.prep.correct import Projections
+from beamline.storage.rules.evidence import ScanEvidence
+from recon.prep.correct import Projections, References
 
 BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
 
@@ -81,7 +83,9 @@ def _mean_bins(raw: NDArray[np.float32], n: int) -> NDArray[np.float32]:
     return np.where(count > 0, total / np.maximum(count, 1), np.float32(np.nan)).astype(np.float32)
 
 
-def tell_damaged(source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn) -> NDArray[np.bool_]:
+def tell_damaged(
+    source: ScanSource, selection: ScanSelection, frames: NDArray[np.int64], warn: Warn
+) -> NDArray[np.bool_]:
     """Report which frames are left out: unreadable ones and, if the selection says so, those that differ from their
     checksum. Each is named in a warning.
     """
@@ -115,25 +119,20 @@ class ViewFilters:
     Attributes:
         filters: in their order.
         done: what each step on views does, by name.
-        rows: detector rows that are wanted, whole bins.
-        binning: pixels averaged per side.
-        height: rows of the detector.
+        selection: rows that are wanted, and binning.
     """
 
     filters: tuple[ViewFilter, ...]
     done: dict[str, StepDone]
-    rows: slice
-    binning: int
-    height: int
+    selection: ScanSelection
 
     @classmethod
-    def of(cls, source: ScanSource, selection: Selection) -> ViewFilters:
+    def of(cls, source: ScanSource, selection: ScanSelection) -> ViewFilters:
         """The filters of a selection.
 
         Raises:
-            ConfigError: rows or binning that do not fit the detector, or filters of counted photons.
+            ConfigError: filters of counted photons.
         """
-        rows = rows_of(source, selection)
         outcomes = {step.name: step.on(source, selection) for step in in_order(selection) if isinstance(step, ViewStep)}
         filters = tuple(each for each, _ in outcomes.values() if each is not None)
         if filters and selection.step(Preparation).noise == "counts":
@@ -141,7 +140,7 @@ class ViewFilters:
                 f"{filters[-1].mixes} neighbouring pixels, so that --noise counts has no likelihood for them."
             )
         done = {name: each for name, (_, each) in outcomes.items()}
-        return cls(filters, done, rows, selection.binning, source.shape[0])
+        return cls(filters, done, selection)
 
     def read(self, rows: slice | None) -> slice:
         """Detector rows to read for some binned rows (None: all), with the margin that filters need."""
@@ -150,7 +149,7 @@ class ViewFilters:
     def within(self, rows: slice | None) -> slice:
         """The same rows, binned, as a slice of what is read for all rows."""
         first, part = self.read(None).start, self.read(rows)
-        return slice((part.start - first) // self.binning, (part.stop - first) // self.binning)
+        return slice(*((edge - first) // self.selection.binning for edge in (part.start, part.stop)))
 
     def apply(self, views: Projections, rows: slice | None) -> Projections:
         """Apply all filters to the views, and return the requested rows."""
@@ -163,11 +162,103 @@ class ViewFilters:
 
     def _widened(self, rows: slice | None) -> tuple[slice, slice]:
         """Detector rows to read, and which of them are wanted, in binned rows."""
-        n, reach = self.binning, sum(each.reach for each in self.filters)
-        first, end = self.rows.start, self.rows.stop
+        n, reach = self.selection.binning, sum(each.reach for each in self.filters)
+        first, end = self.selection.detector_rows.start, self.selection.detector_rows.stop
         if rows is not None:
             start, stop, _ = rows.indices((end - first) // n)
             first, end = first + start * n, first + stop * n
         above = min(reach, first // n)
-        below = min(reach, (self.height - end) // n)
+        below = min(reach, (self.selection.shape[0] - end) // n)
         return slice(first - above * n, end + below * n), slice(above, above + (end - first) // n)
+
+
+class NoViewError(DataError):
+    """None of the requested views can be used."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewReader:
+    """Reads the views of one scan that can be used, and says of the others why they cannot.
+
+    Attributes:
+        selection: what is done with frames that differ from their checksums.
+        filters: rows and binning.
+        references: of the rows that are read, binned; None: the frames are line integrals.
+        named: views without light that were named.
+    """
+
+    scan: ScanEvidence
+    selection: ScanSelection
+    filters: ViewFilters
+    references: References | None
+    warn: Warn
+    named: set[int] = field(default_factory=set)
+
+    def read(
+        self,
+        frames: NDArray[np.int64],
+        rows: slice | None,
+        progress: Callable[[int, int], None] = lambda n, total: None,
+    ) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Pixels [frame, row, col] of the frames that hold a finite one, have light and are not damaged, and these
+        frames; of some binned rows, of all for None."""
+        source = self.scan.source
+        data = read_binned(source, frames, self.filters.read(rows), self.selection.binning, progress)
+        lost = tell_damaged(source, self.selection, frames, self.warn)
+        data, frames = (data[~lost], frames[~lost]) if lost.any() else (data, frames)
+        alive = np.isfinite(data).any(axis=(1, 2))
+        if not alive.all():
+            dark = frames[~alive]
+            if rows is None:  # in a band it says nothing of the views
+                self.warn(
+                    f"{dark.size} of {source.table.views.size} views hold no finite pixel (first: frame "
+                    f"{dark[0]}): left out."
+                )
+            data, frames = data[alive], frames[alive]
+        lit, part, used = np.ones(len(frames), np.bool_), self.filters.within(rows), self.references
+        references = None if used is None else (used.dark[part], used.flats[0][1][part])
+        for at in np.flatnonzero(self.scan.suspect(data, references)):
+            lit[at] = not self.scan.unlit(int(frames[at]))
+        if not lit.all():
+            data, frames = data[lit], frames[lit]
+        if rows is None and used is not None:
+            self._warn_of_copies(data, frames)
+        return data, frames
+
+    def _warn_of_copies(self, data: NDArray[Any], frames: NDArray[np.int64]) -> None:
+        """Warn of views that equal the one before pixel by pixel: no camera takes the same counts twice."""
+        middle = data.shape[1] // 2
+        alike = np.flatnonzero((data[1:, middle] == data[:-1, middle]).all(axis=1))  # soon tells most of them apart
+        copies = [int(frames[at + 1]) for at in alike if np.array_equal(data[at], data[at + 1])]
+        if copies and 2 * len(copies) < len(frames):  # where most are, they were computed
+            self.warn(
+                f"{count(len(copies), 'view')} of {self.scan.source.table.views.size} (frames {spans(copies)}) hold "
+                "the pixels of the view before: the camera or its driver gave an image twice. Their angles are then "
+                "wrong for what they show: leave them out with --views or --flags judge, or repeat them."
+            )
+
+    def tell_unlit(self, asked: NDArray[np.int64], lit: NDArray[np.int64]) -> None:
+        """Name the views without light among those asked for, once, and the gap that they leave."""
+        unlit = np.intersect1d(np.setdiff1d(asked, lit), np.array(self.scan.known_unlit, np.int64))
+        if (news := np.setdiff1d(unlit, sorted(self.named))).size == 0:
+            return
+        gap = f", and{gap_text}" if (gap_text := gap_sentence(self.scan.source, asked, lit)) else ""
+        self.named.update(news.tolist())
+        self.warn(
+            f"{count(news.size, 'view')} of {self.scan.source.table.views.size} (frames {spans(news.tolist())}) have "
+            "no light: the shutter was closed, the beam was gone, or the file was never written there. They are left "
+            f"out{gap}."
+        )
+
+    def no_view(self) -> NoViewError:
+        """The error where none of the views can be used."""
+        beside_flats = (
+            ""
+            if self.references is None
+            else f" The brightest have {self.scan.brightest:.2g} of the flats' light. Where views were divided by "
+            "their flats already, say --quantity transmission, or line-integrals."
+        )
+        return NoViewError(
+            f"{self.scan.source.path}: no chosen view can be used. Their pixels cannot be read, are not finite, have "
+            f"no light, or differ from their checksums.{beside_flats}"
+        )

@@ -11,36 +11,24 @@ from beamline.core.sinks import Note, Warn
 from beamline.core.text import count, spans
 from beamline.monitor.field import beyond_the_field
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.poses import stated_poses
+from beamline.projections.corrections.poses import ScanPoses
 from beamline.projections.corrections.references import uncorrected_current
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.registry import in_order
-from beamline.projections.selection import Selection, pixel_size
-from beamline.storage.readers.averaged import JOINED_DEG
+from beamline.projections.selection import ScanSelection
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import without_air
 from recon.base.masks import areas
 from recon.voxels.direct import has_direct_method
 from recon.voxels.field_edges import FieldEdges
 
 _SAME_AXIS = 0.05  # columns
-_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one view
 
 
-def warn_of_joined_views(source: ScanSource, warn: Warn) -> None:
-    degrees = float(source.attributes.get(JOINED_DEG, 0.0))
-    blur = np.radians(degrees) * source.shape[1] / 2
-    if blur > _JOINED_BLUR:
-        warn(
-            f"--frames-per-view {source.frames_per_view} averages frames that are up to {degrees:.3g} degrees apart, "
-            f"which blurs what lies at the edge of the field by {blur:.0f} pixels. Unless that is meant, give as many "
-            "as the scan took at each angle, or leave it out."
-        )
-
-
-def warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
+def warn_of_units(source: ScanSource, selection: ScanSelection, warn: Warn) -> None:
     """Warn of a size, an energy or a distance that no instrument has, as by a mistaken unit."""
-    size_mm = pixel_size(source, selection)
+    size_mm = selection.pixel_size_mm
     stated = [("pixel_size_um", None if size_mm is None else size_mm * 1e3), ("energy_kev", source.energy_kev)]
     for step in in_order(selection):  # options of the same names
         stated += [(name, getattr(step, name, None)) for name in ("pixel_size_um", "energy_kev", "distance_mm")]
@@ -49,30 +37,30 @@ def warn_of_units(source: ScanSource, selection: Selection, warn: Warn) -> None:
             warn(sentence)
 
 
-def warn_of_other_axis(source: ScanSource, selection: Selection, axis_col: float, warn: Warn) -> None:
+def warn_of_other_axis(poses: ScanPoses | None, selection: ScanSelection, axis_col: float, warn: Warn) -> None:
     """Tell that poses of a volume are used with another rotation axis than they were learnt or used with."""
-    table = stated_poses(source, selection)
-    poses_axis = None if table is None else table.axis_col
-    if poses_axis is not None and selection.axis_col is None and abs(poses_axis - axis_col) > _SAME_AXIS:
+    if poses is None or (of_poses := poses.table.axis_col) is None or selection.axis_col is not None:
+        return
+    if abs(of_poses - axis_col) > _SAME_AXIS:
         warn(
-            f"The poses of {table} go with the rotation axis of that volume, column {poses_axis:.2f}; column "
-            f"{axis_col:.2f} is used. Give --axis {poses_axis:.2f} to have both."
+            f"The poses of {poses.table} go with the rotation axis of that volume, column {of_poses:.2f}; column "
+            f"{axis_col:.2f} is used. Give --axis {of_poses:.2f} to have both."
         )
 
 
-def warn_of_the_field(source: ScanSource, selection: Selection, prepared: PreparedProjections, warn: Warn) -> None:
+def warn_of_the_field(scan: ScanEvidence, selection: ScanSelection, prepared: PreparedProjections, warn: Warn) -> None:
     """Warn of matter beyond the field of view; and of the light and the ring current, where no air corrects them."""
     projections, geometry = prepared.projections, prepared.geometry
     edges = FieldEdges.of(projections.data, geometry, prepared.shares)
     unlevelled = not any(projections.air_columns)
     if sides := edges.beyond():
         light = ""
-        if unlevelled and source.quantity == "counts" and selection.step(Air).model != "none":
-            light = without_air(source, edges.mean)
+        if unlevelled and scan.in_counts and selection.step(Air).model != "none":
+            light = without_air(scan, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
-        wide = not geometry.ordinary.all() or bool(source.table.wide_views.size)
+        wide = not geometry.ordinary.all() or bool(scan.table.wide_views.size)
         warn(f"{cut_sentence(sides, continued, wide)} {light}".rstrip())
-        if unlevelled and (change := uncorrected_current(source, selection)):
+        if unlevelled and (change := uncorrected_current(scan, selection)):
             warn(change)
     elif ranges := edges.passing():
         warn(passing_sentence(ranges, geometry.n_views))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,10 +65,99 @@ class Selection:
         """The step of this class: the given one, or else one with default settings."""
         return next((step for step in self.steps if isinstance(step, kind)), None) or kind()
 
-    def with_steps(self, *steps: NamedStep) -> Selection:
+    def with_steps(self, *steps: NamedStep) -> Self:
         """The same selection with these steps, each replacing the one of its class."""
         kinds = {type(step) for step in steps}
         return replace(self, steps=(*(step for step in self.steps if type(step) not in kinds), *steps))
+
+    def of(self, source: ScanSource) -> ScanSelection:
+        """What this selects of a scan.
+
+        Raises:
+            ConfigError: rows outside the detector, bins larger than what is left, or pixels that no detector has.
+        """
+        size_mm, whose = self.pixel_size_mm, "--pixel-size-um"
+        if size_mm is None:
+            size_mm, whose = source.pixel_size_mm, str(source.path)
+        low, high = _PIXEL_SIZES_UM
+        if size_mm is not None and not low <= size_mm * 1e3 <= high:
+            raise ConfigError(
+                f"{whose}: a pixel size of {size_mm * 1e3:.4g} um; expected {low:g} to {high:g} um. Give the right one "
+                "with --pixel-size-um."
+            )
+        width = source.attributes.get("sample_diameter_mm") if size_mm is not None else None
+        width = width if self.sample_width is None else self.sample_width
+        cone, width = self.cone or source.cone, None if width is None else float(width)
+        stated = {"pixel_size_mm": size_mm, "cone": cone, "sample_width": width}
+        kept = {each.name: getattr(self, each.name) for each in fields(Selection)}
+        return ScanSelection(**{**kept, **stated}, asked=self, shape=source.shape, path=source.path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanSelection(Selection):
+    """What is selected of one scan: where pixel size, cone and width of the sample are left open, those of its file.
+
+    Attributes:
+        rows: those that are read, whole bins.
+        asked: what was asked for.
+        shape: (height, width) of the detector.
+        path: of the file.
+    """
+
+    asked: Selection
+    shape: tuple[int, int]
+    path: Path
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        height, width = self.shape
+        (first, end), n = self.rows or (0, height), self.binning
+        if not 0 <= first < end <= height:
+            raise ConfigError(f"--rows {first}:{end} is out of range: the detector has rows 0:{height}.")
+        if not 1 <= n <= min(end - first, width):
+            raise ConfigError(f"--bin {n} does not fit into {end - first} rows of {width} columns.")
+        object.__setattr__(self, "rows", (first, first + (end - first) // n * n))
+
+    @property
+    def detector_rows(self) -> slice:
+        """The rows that are read."""
+        assert self.rows is not None
+        return slice(*self.rows)
+
+    @property
+    def pivot(self) -> float:
+        """The middle row of the detector, binned and relative to the first row used."""
+        return ((self.shape[0] - 1) / 2 - self.detector_rows.start - (self.binning - 1) / 2) / self.binning
+
+    def geometry(self, axis_col: float, angles: NDArray[np.float64]) -> Geometry:
+        """Geometry of views at `angles` in the rows and with the binning; pitch 1 if it is unknown.
+
+        Raises:
+            ConfigError: a cone beam has no known pixel size, or impossible distances; a central row of a parallel beam.
+        """
+        rows, pitch = self.detector_rows, self.pixel_size_mm
+        full = (rows.stop - rows.start, self.shape[1])
+        if self.cone is not None:
+            if pitch is None:
+                raise ConfigError(
+                    f"{self.path} does not state its pixel size, which a cone beam needs: give --pixel-size-um (on the "
+                    "detector)."
+                )
+            # The central ray meets the same row of the detector, whatever rows are read.
+            meets = (self.shape[0] - 1) / 2 if self.central_row is None else self.central_row
+            try:
+                geometry = Geometry.cone(
+                    angles, full, pitch, *self.cone, axis_col=axis_col, axis_row=meets - rows.start
+                )  # fmt: skip
+            except ValueError as error:
+                raise ConfigError(f"{self.path}: {error}. Give the right ones with --cone SOD:SDD.") from error
+            return geometry.binned(self.binning)
+        if self.central_row is not None:
+            raise ConfigError(
+                f"--central-row is for a cone beam; {self.path} is a parallel one. Leave it out, or give --cone."
+            )
+        pitch = 1.0 if pitch is None else pitch
+        return Geometry.parallel(angles, full, pixel_pitch=pitch, axis_col=axis_col).binned(self.binning)
 
 
 def choose_views(
@@ -93,22 +183,6 @@ def choose_views(
     return chosen
 
 
-def rows_of(source: ScanSource, selection: Selection) -> slice:
-    """The detector rows to read, cropped to whole bins.
-
-    Raises:
-        ConfigError: rows outside the detector, or bins larger than what is left.
-    """
-    height, width = source.shape
-    first, end = selection.rows or (0, height)
-    if not 0 <= first < end <= height:
-        raise ConfigError(f"--rows {first}:{end} is out of range: the detector has rows 0:{height}.")
-    n = selection.binning
-    if not 1 <= n <= min(end - first, width):
-        raise ConfigError(f"--bin {n} does not fit into {end - first} rows of {width} columns.")
-    return slice(first, first + (end - first) // n * n)
-
-
 def check_axis(source: ScanSource, axis_col: float) -> None:
     """Raise ConfigError if the axis lies outside the detector."""
     if sentence := unseen_axis(axis_col, source.shape[1]):
@@ -120,67 +194,7 @@ def unbinned(column: float, binning: int) -> float:
     return column * binning + (binning - 1) / 2
 
 
-def geometry_of(source: ScanSource, selection: Selection, axis_col: float, angles: NDArray[np.float64]) -> Geometry:
-    """Geometry of views at `angles` in the rows and with the binning of `selection`; pitch 1 if it is unknown.
-
-    Raises:
-        ConfigError: a cone beam has no known pixel size, or impossible distances; a central row of a parallel beam.
-    """
-    rows = rows_of(source, selection)
-    full = (rows.stop - rows.start, source.shape[1])
-    pitch = pixel_size(source, selection)
-    if (cone := cone_of(source, selection)) is not None:
-        if pitch is None:
-            raise ConfigError(
-                f"{source.path} does not state its pixel size, which a cone beam needs: give --pixel-size-um (on the "
-                "detector)."
-            )
-        # The central ray meets the same row of the detector, whatever rows are read.
-        meets = (source.shape[0] - 1) / 2 if selection.central_row is None else selection.central_row
-        axis_row = meets - rows.start
-        try:
-            geometry = Geometry.cone(angles, full, pitch, *cone, axis_col=axis_col, axis_row=axis_row)
-        except ValueError as error:
-            raise ConfigError(f"{source.path}: {error}. Give the right ones with --cone SOD:SDD.") from error
-        return geometry.binned(selection.binning)
-    if selection.central_row is not None:
-        raise ConfigError(
-            f"--central-row is for a cone beam; {source.path} is a parallel one. Leave it out, or give --cone."
-        )
-    return Geometry.parallel(angles, full, pixel_pitch=1.0 if pitch is None else pitch, axis_col=axis_col).binned(
-        selection.binning
-    )
-
-
-def pivot_of(source: ScanSource, selection: Selection) -> float:
-    """The middle row of the detector, binned and relative to the first row used."""
-    middle, binning = (source.shape[0] - 1) / 2, selection.binning
-    return (middle - rows_of(source, selection).start - (binning - 1) / 2) / binning
-
-
 def with_pivot(geometry: Geometry, pivot: float) -> Geometry:
     """The geometry whose views roll and tilt about the row `pivot`."""
     # A parallel beam's z = 0 is the middle of its rows, but those views lean about the detector's middle.
     return geometry if geometry.is_straight or geometry.is_cone else replace(geometry, axis_row=pivot)
-
-
-def cone_of(source: ScanSource, selection: Selection) -> tuple[float, float] | None:
-    """(sod, sdd) in mm; None for a parallel beam."""
-    return source.cone if selection.cone is None else selection.cone
-
-
-def pixel_size(source: ScanSource, selection: Selection) -> float | None:
-    """Pixel size in mm, from the selection or the file; None if neither states it.
-
-    Raises:
-        ConfigError: no detector has such pixels.
-    """
-    size_mm = source.pixel_size_mm if selection.pixel_size_mm is None else selection.pixel_size_mm
-    low, high = _PIXEL_SIZES_UM
-    if size_mm is not None and not low <= size_mm * 1e3 <= high:
-        whose = source.path if selection.pixel_size_mm is None else "--pixel-size-um"
-        raise ConfigError(
-            f"{whose}: a pixel size of {size_mm * 1e3:.4g} um; expected {low:g} to {high:g} um. Give the right one "
-            "with --pixel-size-um."
-        )
-    return size_mm

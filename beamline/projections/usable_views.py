@@ -14,6 +14,8 @@ from recon.base.arrays import I64, bin_views
 if TYPE_CHECKING:
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
+    from beamline.storage.rules.treatment import Treatment
     from recon.prep.resample import Resampling
 
 
@@ -121,42 +123,36 @@ WIDE = 2.5
 views are missing."""
 
 
-def usable_views(source: ScanSource, use_flags: bool, judged: FrameFlags | None = None) -> UsableViews:
-    """Projections without an alarm and their weights; all with equal weights if `use_flags` is False.
-
-    Args:
-        judged: flags that count in place of the file's.
-    """
+def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
+    """Projections without an alarm and their weights; all with equal weights if `use_flags` is False."""
     from beamline.storage.rules.treatment import treatment_of
 
-    views, flags = source.table.are_views, source.table.flags if judged is None else judged
+    views, flags = scan.table.are_views, scan.flags
     rows = np.flatnonzero(views)
-    if flags is None or not flags.flagged.any():
+    if flags is None or not (flags.flagged if use_flags else flags.flagged[rows]).any():
         return UsableViews(rows, flags=flags)
     if not use_flags:
-        if not flags.flagged[rows].any():
-            return UsableViews(rows, flags=flags)
         alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
         n = f"{count(int(alarmed.sum()), 'view')} with an alarm and {warned.sum()} with a warning"
         sentence = f"--flags ignore: {n} are used as they are."
         return UsableViews(rows, sentence=sentence, flags=flags)
-    treated = treatment_of(flags, views, source.shape)
+    treated = treatment_of(flags, views, scan.source.shape)
     if not treated.in_words:
         return UsableViews(rows, flags=flags, jumps=treated.jumps)
     weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
     good = np.flatnonzero(views & ~treated.left_out)
-    gap = gap_sentence(source, rows, good)
+    gap = gap_sentence(scan, rows, good)
     sentence = f"{treated.in_words}{gap and f' They{gap}.'} --flags ignore weighs all equally."
-    regions = regions_of(treated.flags, source.shape)
+    regions = regions_of(treated)
     return UsableViews(good, weights, int(treated.left_out.sum()), sentence, flags, regions, treated.jumps)
 
 
-def gap_sentence(source: ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
+def gap_sentence(scan: ScanEvidence | ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:
     """ " leave 12° without a view" if the remaining views have such a gap that the views before did not have; else
     empty.
     """
-    period = np.pi if source.cone is None else 2 * np.pi
-    narrow, wide = (_widest_gap(source.table.angles[some], period) for some in (before, after))
+    period = np.pi if scan.cone is None else 2 * np.pi
+    narrow, wide = (_widest_gap(scan.table.angles[some], period) for some in (before, after))
     return f" leave {np.degrees(wide):.3g}° without a view" if wide >= WIDE * narrow else ""
 
 
@@ -166,23 +162,11 @@ def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
     return period if sorted_angles.size == 0 else float(np.diff(sorted_angles, append=sorted_angles[0] + period).max())
 
 
-def regions_of(flags: FrameFlags, shape: tuple[int, int]) -> Regions:
-    """The regions of warnings and alarms in frames of this shape; rays in an alarm region have weight 0."""
-    from beamline.storage.rules.treatment import boxes_of, flagged_in_part
-
-    boxes = [
-        (frame, box, 0.0 if flags.bits[frame] >> entry.alarm_bit & 1 else WARNED_SHARE)
-        for i, entry in enumerate(flags.legend)
-        for frame, box in boxes_of(flags, i, entry, shape)
-        if box is not None
-    ]
-    local = flagged_in_part(flags, shape)
-    kept = [each for each in boxes if local[each[0]]]
-    return Regions(
-        np.array([frame for frame, _, _ in kept], np.int64),
-        np.array([box for _, box, _ in kept], np.int64).reshape(-1, 4),
-        np.array([share for _, _, share in kept], np.float32),
-    )
+def regions_of(treated: Treatment) -> Regions:
+    """The regions of warnings and alarms in frames; rays in an alarm region have weight 0."""
+    frames, boxes, alarms = zip(*treated.parts, strict=True) if treated.parts else ((), (), ())
+    shares = np.where(np.array(alarms, np.bool_), np.float32(0), np.float32(WARNED_SHARE))
+    return Regions(np.array(frames, np.int64), np.array(boxes, np.int64).reshape(-1, 4), shares)
 
 
 def part_numbers(jumps: I64, rows: I64) -> I64:

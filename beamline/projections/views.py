@@ -17,23 +17,20 @@ from beamline.projections.corrections.width import Width
 from beamline.projections.protocols import GeometryLearnt, PlaceStep, ViewMotion
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.replay import judged_flags
-from beamline.projections.selection import Selection, choose_views, geometry_of
+from beamline.projections.selection import ScanSelection, Selection, choose_views
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.transforms import WRAPPED
 from beamline.storage.rules import Finding, angles_shown
-from beamline.storage.rules.light import darks_beside_views
-from beamline.storage.rules.pixels import numbers_wrapped, quantity_stated
-from beamline.storage.rules.references import references_usable
-from beamline.storage.rules.scan import VARYING, central_ray_taken, references_present, scan_ended, scan_findings
+from beamline.storage.rules.evidence import Asked, ScanEvidence
+from beamline.storage.rules.scan import VARYING, findings_of
 from beamline.storage.rules.stored_order import SINOGRAM
-from beamline.storage.rules.treatment import frames_flagged
+from beamline.storage.rules.treatment import FLAGS
 from recon.base.geometry import Geometry
 
 
-def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
+def stated_geometry(source: ScanSource, selection: ScanSelection) -> Geometry:
     """The geometry of the selected views, as scan and options state it, before any frame is read.
 
     An axis that is to be found is taken in the middle; views without an angle or a pose are left out.
@@ -49,7 +46,7 @@ def stated_geometry(source: ScanSource, selection: Selection) -> Geometry:
     frames = frames[choose_views(source, frames, selection)]
     stated = source.axis_col if selection.axis_col is None else selection.axis_col
     axis_col = (source.shape[1] - 1) / 2 if stated is None else stated
-    geometry = geometry_of(source, selection, axis_col, source.table.angles[frames])
+    geometry = selection.geometry(axis_col, source.table.angles[frames])
     if poses is not None:
         geometry = poses.corrected(geometry, frames)
     return selection.step(Width).rays(source, selection, geometry)[0]
@@ -66,8 +63,8 @@ class ViewGeometry:
         learnt: what was learnt of the geometry, by the name of the step.
     """
 
-    source: ScanSource
-    selection: Selection
+    scan: ScanEvidence
+    selection: ScanSelection
     stated_axis: float
     moved: dict[str, ViewMotion] = field(default_factory=dict)
     width: StepDone = field(default_factory=StepDone)
@@ -87,7 +84,7 @@ class ViewGeometry:
     def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
         """Let each step find the sample position; returns the `usable` views that remain usable."""
         for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
-            motion = step.place(self.source, self.selection, usable, self.stated_axis, phases.progress)
+            motion = step.place(self.scan, self.selection, usable, self.stated_axis, phases.progress)
             self.moved[step.name] = motion
             if motion.done.sentence:
                 warn(motion.done.sentence)
@@ -99,17 +96,18 @@ class ViewGeometry:
         for step in geometry_steps(self.selection):
             if step.geometry:
                 phases.enter("calibration", "steps")
-                learnt = step.learn(self.source, self.selection, view_ids, self.uncalibrated, phases.progress)
+                learnt = step.learn(self.scan, self.selection, view_ids, self.uncalibrated, phases.progress)
                 self.learnt[step.name] = learnt
 
-    def uncalibrated(self, part: Selection, view_ids: NDArray[np.int64]) -> Geometry:
+    def uncalibrated(self, part: ScanSelection, view_ids: NDArray[np.int64]) -> Geometry:
         """The geometry of views without calibration."""
-        geometry = geometry_of(self.source, part, self.stated_axis, self.source.table.angles[view_ids])
-        if (aside := self.source.table.aside) is not None:
+        source = self.scan.source
+        geometry = part.geometry(self.stated_axis, source.table.angles[view_ids])
+        if (aside := source.table.aside) is not None:
             geometry = replace(geometry, shifts=np.outer(aside[view_ids] / geometry.pixel_pitch, (1.0, 0.0)))
         for motion in self.moved.values():
             geometry = motion.corrected(geometry, view_ids)
-        geometry, self.width = part.step(Width).rays(self.source, part, geometry)
+        geometry, self.width = part.step(Width).rays(source, part, geometry)
         return geometry
 
     def of(self, view_ids: NDArray[np.int64]) -> Geometry:
@@ -123,7 +121,19 @@ class ViewGeometry:
 _OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules on what vectors of each view take the place of
 
 
-def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> UsableViews:
+def asked_of(source: ScanSource, selection: Selection) -> Asked:
+    """What a selection asks of the evidence of a scan; the monitor looks at its frames where that is asked for."""
+    asked = selection.step(Preparation)
+    judged = judged_flags(source) if asked.judged and source.finished else None
+    return Asked(asked.accepted, selection.cone, judged)
+
+
+def evidence_of(source: ScanSource, selection: Selection) -> ScanEvidence:
+    """The evidence of a scan for a reconstruction of `selection`."""
+    return ScanEvidence(source, asked_of(source, selection))
+
+
+def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> UsableViews:
     """The usable views of a finished scan, by the flags of the monitor.
 
     Faults of the file that do not prevent a reconstruction are warned of, and so is the effect of the flags.
@@ -132,23 +142,17 @@ def checked_views(source: ScanSource, selection: Selection, warn: Warn) -> Usabl
         DataError: it cannot be reconstructed; with every reason, and what to do about each.
     """
     asked = selection.step(Preparation)
-    if selection.cone is not None:  # what the rules judge is the beam that is taken
-        source = Frames(source, cone=selection.cone)
-    judged = judged_flags(source) if asked.judged and source.finished else None
     by_option = {
         "central-column": selection.axis_col,
         "central-row": selection.central_row,
-        VARYING: selection.pixel_size_mm if selection.cone is None else selection.cone,
+        VARYING: selection.asked.pixel_size_mm if selection.asked.cone is None else selection.asked.cone,
     }
-    findings = [*scan_findings(source), *scan_ended(source), *central_ray_taken(source)]
-    findings = [hit for hit in findings if by_option.get(hit.rule) is None]
-    findings += [*references_usable(source, asked.accepted), *darks_beside_views(source, asked.accepted)]
-    if asked.uses_flags:
-        findings += [finding for finding in frames_flagged(source, judged) if finding.severity == "error"]
-    if (poses := stated_poses(source, selection)) is not None and poses.vectors is not None:
+    findings = [hit for hit in findings_of(scan) if by_option.get(hit.rule) is None]
+    findings = [hit for hit in findings if hit.rule != FLAGS or (asked.uses_flags and hit.severity == "error")]
+    if (poses := stated_poses(scan.source, selection)) is not None and poses.vectors is not None:
         findings = [finding for finding in findings if finding.rule not in _OF_A_CIRCLE]
-    refuse(source, findings)
-    usable = usable_views(source, asked.uses_flags, judged)
+    refuse(scan.source, findings)
+    usable = usable_views(scan, asked.uses_flags)
     if usable.sentence:
         warn(Note(usable.sentence))
     for finding in findings:
@@ -164,10 +168,3 @@ def refuse(source: ScanSource, findings: Iterable[Finding]) -> None:
     reasons = [finding.message for finding in wrapped or errors]
     if reasons:
         raise DataError(f"{source.path} cannot be reconstructed. " + "\n  ".join(reasons))
-
-
-def correction_blockers(source: ScanSource, selection: Selection) -> list[Finding]:
-    """Reasons why the frames of a running scan cannot be corrected yet."""
-    checked = () if selection.step(Preparation).accepted else (references_usable,)
-    rules = (quantity_stated, references_present, numbers_wrapped, *checked)
-    return [finding for rule in rules for finding in rule(source)]

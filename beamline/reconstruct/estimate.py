@@ -11,7 +11,7 @@ from beamline.core.errors import DataError
 from beamline.core.machine import Need
 from beamline.core.text import count, size
 from beamline.projections.prepare import require_usable
-from beamline.projections.selection import check_axis, cone_of
+from beamline.projections.selection import check_axis
 from beamline.reconstruct.memory import recon_memory_of
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.plan import planned, refuse_before_reading
@@ -141,6 +141,6 @@ def _refuse_scan(source: ScanSource, options: ReconOptions) -> None:
     """Raise ConfigError and DataError as the reconstruction, before it reads a frame."""
     selection = options.selection
     require_usable(source, selection)
-    for axis in (selection.axis_col, source.axis_col if cone_of(source, selection) is None else None):
+    for axis in (selection.axis_col, source.axis_col if selection.of(source).cone is None else None):
         if axis is not None:
             check_axis(source, axis)

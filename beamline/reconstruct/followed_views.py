@@ -17,10 +17,11 @@ from beamline.projections.axis import locate_axis, stated_axis
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.width import Width
-from beamline.projections.selection import Selection, cone_of, geometry_of
+from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
@@ -78,7 +79,7 @@ class FollowedViews:
     """The selected views of a scan file that is still growing."""
 
     source: ScanSource
-    selection: Selection
+    selection: ScanSelection
 
     @property
     def n(self) -> int:
@@ -87,7 +88,7 @@ class FollowedViews:
 
     def usable(self) -> UsableViews:
         """The views in the file that may be used."""
-        return usable_views(self.source, self.selection.step(Preparation).uses_flags)
+        return usable_views(ScanEvidence(self.source), self.selection.step(Preparation).uses_flags)
 
     def chosen(self, frames: NDArray[np.int64]) -> NDArray[np.int64]:
         """Which of these frames the selection uses, by their index among all views so far, which later views do not
@@ -97,13 +98,9 @@ class FollowedViews:
         chosen = parse_views(self.selection.views, np.zeros(taken.size))
         return frames[np.isin(frames, taken[chosen])]
 
-    def template(self, axis_col: float) -> Geometry:
-        """The geometry of one view at 0 rad, with the axis in this column of the full detector."""
-        return geometry_of(self.source, self.selection, axis_col, np.zeros(1))
-
     def geometry(self, axis_col: float, view_ids: NDArray[np.int64]) -> tuple[Geometry, StepDone]:
         """The geometry of views with the width of their rays, and what was done about that."""
-        geometry = geometry_of(self.source, self.selection, axis_col, self.source.table.angles[view_ids])
+        geometry = self.selection.geometry(axis_col, self.source.table.angles[view_ids])
         return self.selection.step(Width).rays(self.source, self.selection, geometry)
 
     def angles(self, axis_col: float, view_ids: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -130,7 +127,7 @@ class AxisSearch:
         settled: the search is over.
     """
 
-    def __init__(self, source: ScanSource, selection: Selection, warn: Warnings) -> None:
+    def __init__(self, source: ScanSource, selection: ScanSelection, warn: Warnings) -> None:
         self._source, self._selection, self._warn = source, selection, warn
         self.col = source.axis_col if selection.axis_col is None else selection.axis_col
         self.estimate: AxisEstimate | None = None
@@ -144,7 +141,7 @@ class AxisSearch:
         Raises:
             DataError: the scan has ended, and no axis is found.
         """
-        if cone_of(self._source, self._selection) is not None:
+        if self._selection.cone is not None:
             self.col, self.settled = stated_axis(self._source), True
             return
         before, self._turned = self._turned, float(np.ptp(self._source.table.angles[views])) * (1 + 1.5 / views.size)

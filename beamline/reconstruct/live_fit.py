@@ -30,19 +30,20 @@ from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, checked_views, correction_blockers, refuse
+from beamline.projections.views import ViewGeometry, checked_views, evidence_of, refuse
 from beamline.reconstruct.followed_views import AxisSearch, Cursor, FollowedViews, FollowState, PassLaws
 from beamline.reconstruct.job import corrections_done, progress_events
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.scan import BEFORE_VIEWS, findings_of
 from drivers.base.clock import Clock
 from recon.base.method import Progress
 from recon.prep.correct import Projections, merge_and_empty
 from recon.splatting.stream import StreamingFit
 from recon.splatting.time_limit import FinalFit
 
-_NONE = np.empty(0, np.int64)
+_NONE, _ONE_VIEW = np.empty(0, np.int64), np.zeros(1)  # rows of the file; rad
 BATCH_VIEWS = 32  # views corrected before the fit goes on
 _LEAST_VIEWS = 16  # of a volume after a stop
 _BEHIND = 0.5  # steps a view: with fewer, FBP shows more of the views (tests/bench/test_live_accuracy.py)
@@ -67,9 +68,11 @@ class ScanFollower:
         self.source = source
         self.state = FollowState.WAITS_FOR_REFERENCES
         self._options, self._sink, self._clock, self._warn = options, sink, clock, warn
-        self.views, self._cursor = FollowedViews(source, options.selection), Cursor()
+        self._selection = options.selection.of(source)
+        self.views, self._cursor = FollowedViews(source, self._selection), Cursor()
         self._references_follow = False  # darks or flats come after the views
-        self._axis = AxisSearch(source, options.selection, warn)
+        self._axis = AxisSearch(source, self._selection, warn)
+        self._scan = evidence_of(source, self._selection)
         self._correction: ScanCorrection | None = None  # None: waits for references
         self._fit: StreamingFit | None = None
         self._history: list[Progress] = []
@@ -132,7 +135,8 @@ class ScanFollower:
         Raises:
             DataError: the scan has ended, or something else is missing, and nothing will come.
         """
-        blockers = correction_blockers(self.source, self._options.selection)
+        self._scan = self._scan.renewed()
+        blockers = findings_of(self._scan, BEFORE_VIEWS)
         if not ended and (self._references_follow or any(finding.rule == "references" for finding in blockers)):
             if not self._references_follow:
                 message = "No darks or no flats before the views: the volume begins when the scan has ended"
@@ -140,8 +144,8 @@ class ScanFollower:
             self._references_follow = True
             return False
         refuse(self.source, blockers)
-        self._correction = ScanCorrection(self.source, self._options.selection, self._warn)
-        self._tell(self._correction.done)
+        self._correction = ScanCorrection(self._scan, self._selection, self._warn)
+        self._tell(self._correction.plan.done)
         return True
 
     def _look_for_axis(self, views: NDArray[np.int64], ended: bool) -> None:
@@ -154,7 +158,7 @@ class ScanFollower:
         if abs(self.axis_col - before) > _AXIS_MOVES:
             self._fit = None
         else:
-            self._fit.move_axis(self.views.template(self.axis_col).axis_col)
+            self._fit.move_axis(self._selection.geometry(self.axis_col, _ONE_VIEW).axis_col)
 
     def _feed_batch(self, views: NDArray[np.int64], ended: bool) -> None:
         """Feed the fit with the next views, all of one part of the file, as each part has its own references."""
@@ -224,7 +228,7 @@ class ScanFollower:
         options, again = self._options, bool(self._history)
         now = self._clock.now()
         self._sink(ReconStarted(self.source.path, options.method.name, self.views.n, axis_col, again, time=now))
-        fit = options.streaming.stream(self.views.template(axis_col), options.seed, self._clock.now)
+        fit = options.streaming.stream(self._selection.geometry(axis_col, _ONE_VIEW), options.seed, self._clock.now)
         for batch in self._cursor.batches:
             fit.add_views(batch.data, self.views.angles(axis_col, batch.view_ids))
         self._cursor = replace(self._cursor, newest=None)  # the next views bring it again
@@ -252,9 +256,9 @@ class ScanFollower:
         if gone:
             why = f"{count(gone, 'view')} turned out bad or taken again when the fit had used them: it unlearns them"
         self._sink(StateEntered("correcting", why, time=self._clock.now()))
-        self._correction = self._correction.renewed()
         self._cursor = replace(self._cursor, batches=())  # not both in memory
-        again = self._correction.at_once(np.union1d(frames, wide))
+        self._correction = self._correction.renewed(every := np.union1d(frames, wide))
+        again = self._correction.at_once(every)
         self._cursor = replace(self._cursor, batches=(again,))
         ordinary = again.data[~np.isin(again.view_ids, wide)] if wide.size else again.data
         self._fit.replace_views(ordinary, kept if gone else None)
@@ -315,11 +319,12 @@ class ScanFollower:
         Raises:
             DataError: a scan without two views that can be used.
         """
-        usable = checked_views(self.source, self._options.selection, self._warn)
+        self._scan = self._scan.renewed()
+        usable = checked_views(self._scan, self._selection, self._warn)
         assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
-        steps = in_order(self._options.selection)
+        steps = in_order(self._selection)
         if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
@@ -360,12 +365,12 @@ class ScanFollower:
     def _prepared(self, axis_col: float, usable: UsableViews) -> PreparedProjections:
         """All views, once recorded, after the steps that need all of them."""
         assert self._correction is not None and self._fit is not None
-        selection, projections = self._options.selection, self._joined()
-        places = ViewGeometry(self.source, selection, axis_col)
+        selection, projections = self._selection, self._joined()
+        places = ViewGeometry(self._scan, selection, axis_col)
         geometry, axis = places.of(projections.view_ids), (axis_col, self._axis.estimate)
-        compare_with_flats(self.source, selection, projections, self._warn, refused=False)
-        prepared = assemble(self.source, selection, projections, geometry, axis, usable, self._warn)
-        done = {**self._correction.done, **places.done}
+        compare_with_flats(self._scan, selection, projections, self._warn, refused=False)
+        prepared = assemble(self._scan, selection, projections, geometry, axis, usable, self._warn)
+        done = {**self._correction.plan.done, **places.done}
         for step in in_order(selection):
             if isinstance(step, PlaceStep):
                 done[step.name] = StepDone(parameters={})  # views are taken as if the sample had not moved

@@ -148,7 +148,7 @@ def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
         ConfigError: the selection does not fit the scan.
         DataError: the poses do not.
     """
-    selection, method = options.selection, options.method
+    selection, method = options.selection.of(source), options.method
     geometry = stated_geometry(source, selection)
     pixel = source.dtype.itemsize if selection.binning == 1 else 4
     part = ScanPart(source, selection, geometry)

@@ -22,7 +22,7 @@ from beamline.core.text import size
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import check_axis, cone_of
+from beamline.projections.selection import check_axis
 from beamline.reconstruct.memory import (
     ReconMemory,
     cluster,
@@ -97,13 +97,13 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
         return _plan(options, needs, allowed)
     if options.partial is None:
         options.target.refuse_partial()
-    if options.method.volumes == 1 and cone_of(source, options.selection) is not None:
+    if options.method.volumes == 1 and options.selection.of(source).cone is not None:
         raise DataError(
             f"{source.path}: {options.method.name} would take {size(at_once)}, {size(allowed)} of memory may be used, "
             "and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
         )
     refuse_whole(source, options, needs, allowed)
-    turned = options.selection.step(TiltAndLens).of(source, options.selection) is not None
+    turned = options.selection.step(TiltAndLens).of(source, options.selection.of(source)) is not None
     needs = replace(needs, weighted=turned and options.method.weighs)  # other weights are not known yet
     return _in_slabs(source, options, needs, allowed)
 
@@ -244,8 +244,8 @@ def prepare_within(
     if "times" in options.method.takes:
         prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
     if options.method.knows_outside:
-        views = prepared.projections.data, prepared.geometry, prepared.ray_factors(), prepared.sample_radius
-        prepared = replace(prepared, sample_radius=sample_radius(*views) or 0.0)  # it is not searched again
+        radius = sample_radius(prepared.views, prepared.sample_radius) or 0.0  # it is not searched again
+        prepared = replace(prepared, sample_radius=radius)
     return prepared, of_views(source, options, plan, prepared)
 
 

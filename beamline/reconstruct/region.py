@@ -14,7 +14,7 @@ from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.registry import geometry_steps
-from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
+from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource
 from recon.base.arrays import F32, Mask
 from recon.base.geometry import Geometry
@@ -95,9 +95,10 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
         ConfigError: a cone, or a region beyond the rows or the widest volume; options that may lean views or move them
             along the axis. `locate` refuses what only the views tell.
     """
-    if cone_of(source, selection) is not None:
+    part = selection.of(source)
+    if part.cone is not None:
         raise ConfigError(f"--roi is for a parallel beam; {source.path} is a cone. Give --rows instead.")
-    poses = stated_poses(source, selection)
+    poses = stated_poses(source, part)
     moving = [(step, term) for step in geometry_steps(selection) for term in ("roll", "tilt", "shifts")]
     given = [f"{step.asked_by} {term}" for step, term in moving if term in step.geometry]
     if poses is not None and (poses.shifts[:, 1].any() or poses.leans):
@@ -107,7 +108,7 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
             f"--roi needs slices that are aligned with rows, and {' and '.join(given)} may misalign them. Give --rows "
             "instead of --roi, or leave that out. Nothing was read."
         )
-    rows, side, (first, end) = rows_of(source, selection), selection.binning, region.z
+    rows, side, (first, end) = part.detector_rows, selection.binning, region.z
     slices = (rows.stop - rows.start) // side
     if end > slices:
         raise ConfigError(f"--roi {region}: slices {first}:{end} are out of range: the volume has slices 0:{slices}.")
@@ -158,7 +159,7 @@ def _widest(source: ScanSource, selection: Selection) -> int:
     moved = selection.step(Preparation).judged or (flags is not None and bool(flags.flagged.any()))
     if selection.axis_col is None or moved:
         return 2 * (source.shape[1] // selection.binning)
-    return Grid.matching(geometry_of(source, selection, selection.axis_col, np.zeros(1))).shape[2]
+    return Grid.matching(selection.of(source).geometry(selection.axis_col, np.zeros(1))).shape[2]
 
 
 _VIEWS = 72  # looked at, or up to twice as many
@@ -183,9 +184,10 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     Raises:
         ConfigError: a cone. DataError: no view shows matter.
     """
-    if cone_of(source, selection) is not None:
+    part = selection.of(source)
+    if part.cone is not None:
         raise ConfigError(f"--roi auto is for a parallel beam; {source.path} is a cone. Give --rows instead.")
-    rows, side = rows_of(source, selection), selection.binning
+    rows, side = part.detector_rows, selection.binning
     height, width = (rows.stop - rows.start) // side, source.shape[1] // side
     coarse = max(1, min(width // _COLUMNS, height))
     every = max(1, source.table.views.size // _VIEWS)
@@ -194,7 +196,7 @@ def box_around_sample(source: ScanSource, selection: Selection) -> Region:
     look = replace(selection, views=views, binning=side * coarse).with_steps(*unlearnt)
     prepared = prepare_projections(source, look, lambda warning: None)  # they come again, of the views used
     data, geometry = prepared.projections.data, prepared.geometry
-    grid = Grid.matching(geometry_of(source, selection, prepared.axis_col, geometry.angles))
+    grid = Grid.matching(part.geometry(prepared.axis_col, geometry.angles))
     across = grid.shape[2]
     # Edges of matter do not show the air, from which matter in any row would rise.
     if cut := FieldEdges.of(data, geometry).beyond():

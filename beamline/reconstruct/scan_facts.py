@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING
 
 from beamline.monitor.check import Level
 from beamline.storage.flag_legend import FlagBit
-from beamline.storage.rules.references import groups_of
+from beamline.storage.rules.evidence import ScanEvidence, groups_of
 from recon.base.arrays import bin_views
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def reference_images(source: ScanSource) -> dict[str, NDArray[np.float32]]:
     """
     if source.quantity != "counts":
         return {}
-    darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
+    darks, flats = (groups_of(source.table, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
     shown = {"dark": darks[:1], "flats": flats[:1], "last flats": flats[1:][-1:]}
     images = {}
     for title, groups in shown.items():
@@ -210,7 +210,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
         references=reference_images(source),
         shape=source.shape,
         columns=columns,
-        ended=" ".join(finding.message for finding in scan_ended(source)) if source.finished else "",
+        ended=" ".join(finding.message for finding in scan_ended(ScanEvidence(source))) if source.finished else "",
         frames_per_view=source.frames_per_view,
     )  # fmt: skip
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from beamline.report.figures import (
     WIDTH,
@@ -30,16 +31,21 @@ if TYPE_CHECKING:
 
 
 COLUMNS = 4
+_CROP = 200  # pixels a side: of larger slices the part is shown in which they differ most
 
 
 class SliceSheet:
-    """The slice [y, x] of each volume through the bright parts of the first one, by label.
+    """The slice [y, x] of each volume by label: through the bright parts of the first one, in its grey window.
 
-    `down`: name of the axis that goes down, of volumes that are turned.
+    Args:
+        down: name of the axis that goes down, of volumes that are turned.
+        across: slices beside one another.
+        closer: the middle slice instead, and of large ones the part in which they differ most, in the window of all.
     """
 
-    def __init__(self, down: str = "y") -> None:
-        self._at, self._down, self._window = 0, down, (0.0, 1.0)
+    def __init__(self, down: str = "y", across: int = COLUMNS, *, closer: bool = False) -> None:
+        self._down, self._across, self._closer = down, across, closer
+        self._at, self._window = 0, (0.0, 1.0)
         self._shown: dict[str, F32] = {}
         self._drawn: set[tuple[str, str]] = set()
 
@@ -50,30 +56,60 @@ class SliceSheet:
         if not self._shown:
             self._at, self._window = bright_centre(volume)[0], matter_window(volume)
         self._drawn.add((family, method))
-        self._shown[label] = volume[self._at].copy()
+        self._shown[label] = volume[len(volume) // 2 if self._closer else self._at].copy()
 
     def labels(self, method: str = "") -> list[str]:
         """The labels of slices that belong to no row, then those of a method ("": none)."""
         return [label for label in self._shown if label.rpartition(": ")[2] in (label, method)]
 
-    def png(self, labels: Sequence[str]) -> bytes:
-        """PNG of these slices, four beside one another, in the grey window of matter in the first volume."""
-        low, high = self._window
-        rows, cols = self._shown[labels[0]].shape
-        head, gap, down = round(0.12 * cols), round(0.04 * cols), -(-len(labels) // COLUMNS)
+    def png(self, labels: Sequence[str], marks: Mapping[str, tuple[str, str]] | None = None) -> bytes:
+        """PNG of these slices, all in the size of the largest.
+
+        Args:
+            marks: a line below the label, and the colour of a frame, by label; empty: none.
+        """
+        from matplotlib.patches import Rectangle
+
+        images, window = [self._shown[label] for label in labels], self._window
+        if self._closer:
+            images = [image[_differ_most(images)] for image in images]
+            window = matter_window(*images)
+        rows, cols = np.max([image.shape for image in images], axis=0).tolist()
+        gap, down, lines = round(0.04 * cols), -(-len(labels) // self._across), 3 if marks else 2
+        head = round(0.06 * lines * cols)
         # One image: a panel for each slice takes ten times as long to draw.
-        sheet = np.full((down * (rows + head), COLUMNS * (cols + gap)), np.nan, np.float32)
+        sheet = np.full((down * (rows + head), self._across * (cols + gap)), np.nan, np.float32)
         size = (WIDTH, WIDTH * sheet.shape[0] / sheet.shape[1])
         figure = new_figure(size, dpi_for(sheet.shape[1], WIDTH), False)
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set_axis_off()
-        for i, label in enumerate(labels):
-            top, left = i // COLUMNS * (rows + head), i % COLUMNS * (cols + gap)
-            sheet[top + head : top + head + rows, left : left + cols] = self._shown[label]
-            axes.text(left + cols / 2, top + 0.6 * head, label.rpartition(": ")[0] or label, fontsize=7, ha="center")
+        for i, (label, image) in enumerate(zip(labels, images, strict=True)):
+            top, left = i // self._across * (rows + head) + head, i % self._across * (cols + gap)
+            nearest = (np.arange(n) * own // n for n, own in zip((rows, cols), image.shape, strict=True))
+            sheet[top : top + rows, left : left + cols] = image[np.ix_(*nearest)]
+            below, colour = (marks or {}).get(label, ("", ""))
+            words = "\n".join(filter(None, (label.rpartition(": ")[0] or label, below)))
+            axes.text(
+                left + cols / 2, top - 0.8 * head / lines, words, fontsize=7, ha="center", color=colour or "black"
+            )
+            if colour:
+                axes.add_patch(Rectangle((left - 0.5, top - 0.5), cols, rows, fill=False, ec=colour, lw=2.5))
         axes.text(0.02 * cols, head + 0.95 * rows, f"x → {self._down} ↓", fontsize=6, color="tab:orange")
-        axes.imshow(sheet, cmap="gray", vmin=low, vmax=high, interpolation="nearest", aspect="auto")
+        axes.imshow(sheet, cmap="gray", vmin=window[0], vmax=window[1], interpolation="nearest", aspect="auto")
         return png(figure)
+
+
+def _differ_most(images: Sequence[F32]) -> tuple[slice, slice]:
+    """The square in which images of one size differ most; all of them where they are small or differ in size."""
+    shape = images[0].shape
+    if max(shape) <= _CROP or any(image.shape != shape for image in images):
+        return slice(None), slice(None)
+    size = tuple(min(_CROP, n) for n in shape)
+    sums = ndimage.uniform_filter(np.ptp(np.stack(images), axis=0), size, mode="constant")
+    whole = [slice(n // 2, side - (n - 1) // 2) for n, side in zip(size, shape, strict=True)]  # squares in the image
+    at = np.unravel_index(int(np.argmax(sums[tuple(whole)])), sums[tuple(whole)].shape)
+    rows, cols = (slice(int(first), int(first) + n) for first, n in zip(at, size, strict=True))
+    return rows, cols
 
 
 @dataclass(frozen=True, eq=False)

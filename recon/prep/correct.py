@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from functools import cached_property
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from recon.base.arrays import I64, Mask, without_mask
+from recon.base.arrays import F32, F64, I64, Mask, without_mask
 from recon.base.choices import SPOT_ERRORS
 from recon.base.declared_types import check_arguments, check_settings
-from recon.base.masks import Image, areas, fill, plan_fill
+from recon.base.masks import Fill, Image, areas, fill, plan_fill
 from recon.prep.counts import Photons, of_view
+from recon.prep.dynamic_flats import DynamicFlats
 from recon.prep.references import References as References
 from recon.prep.references import (
     air_columns,
@@ -109,76 +110,68 @@ class Projections:
         return None if lit.all() else lit
 
 
-class Correction:
-    """Correction of one scan's views, which come in the order they were taken, in batches of any size.
+@dataclass(frozen=True, eq=False)
+class CorrectionPlan:
+    """What makes line integrals of the counts of one scan; `survey` makes it, and `apply` follows it.
 
-    For each batch: `transmission`, then `survey`, then `line_integrals`. A view depends on the references, on the air
+    Views come in the order they were taken, in batches of any size. A view depends on the references, on the air
     columns found in all views surveyed so far, and on its two neighbours. So the newest view waits for the next one.
     With the same references and air columns the line integrals are the same to the bit for any split into batches.
+
+    Attributes:
+        settings: of the correction.
+        dark: float32 [row, col].
+        flats: (position, float32 [row, col]) of each group of flats, in order, without its dark; 1 in masked pixels.
+        part_starts, dynamic: as of `References`.
+        masked: bool [row, col], pixels that are filled in every view.
+        photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`; None:
+            the line integrals are logarithms.
+        foreign: bool [row], rows in which what is dark is not the sample, see `unmeasured`; None: none.
+        light: float64 [frame of the scan], by how much that of a view grows; None: all views are alike.
+        spots: the filter of spots after the views so far.
+        profiles: `edge_profiles` of the views so far, by batch, with their numbers int64 [view].
     """
 
-    def __init__(
-        self,
-        references: References,
-        settings: CorrectionSettings | None = None,
-        masked: Mask | None = None,
-        photons: Photons | None = None,
-        foreign: Mask | None = None,
-    ) -> None:
-        """Take the references.
+    settings: CorrectionSettings
+    dark: Image
+    flats: tuple[tuple[float, Image], ...]
+    part_starts: tuple[int, ...]
+    dynamic: DynamicFlats | None
+    masked: Mask
+    spots: SpotFilter
+    photons: Photons | None = None
+    foreign: Mask | None = None
+    light: F64 | None = None
+    profiles: tuple[tuple[F32, I64], ...] = ()
 
-        Args:
-            references: darks and flats of the detector area of the views.
-            masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
-            photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`;
-                None: the line integrals are logarithms.
-            foreign: bool [row], rows in which what is dark is not the sample, see `unmeasured`; None: none.
+    @cached_property
+    def _hidden(self) -> Mask:
+        return areas(self.masked)
 
-        Raises:
-            ValueError: for shapes that do not fit, no flats, or no beam in the flats.
-        """
-        self._settings = CorrectionSettings() if settings is None else settings
-        check(references)
-        self._dark = np.asarray(references.dark, np.float32)
-        air, cols = self._settings.air, self._dark.shape[1]
-        if isinstance(air, tuple) and not (min(air) >= 0 and 0 < sum(air) <= cols):
-            raise ValueError(f"air columns (left, right) {air} do not fit {cols} columns")
-        if masked is not None and np.shape(masked) != self._dark.shape:
-            raise ValueError(f"masked must have shape {self._dark.shape}, got {np.shape(masked)}")
-        if masked is None:
-            masked = dead_pixels(self._dark, [flat for _, flat in references.flats], self._settings.hot_threshold)
-        self.masked, self._hidden, self._foreign = masked, areas(masked), foreign
-        self._fill, self._photons, self._dynamic = plan_fill(masked), photons, references.dynamic
-        with np.errstate(invalid="ignore", over="ignore"):
-            self._flats = [
-                (position, np.where(masked, np.float32(1), np.asarray(flat, np.float32) - self._dark))
-                for position, flat in sorted(references.flats, key=lambda group: group[0])
-            ]
-        self._part_starts = references.part_starts
-        self._profiles: list[NDArray[np.float32]] = []
-        self._surveyed: list[NDArray[np.int64]] = []
-        self.spots = SpotFilter(self._settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
+    @cached_property
+    def _filling(self) -> Fill:
+        return plan_fill(self.masked)
 
-    @property
+    @cached_property
     def air_columns(self) -> tuple[int, int]:
         """(left, right) columns of air from the views surveyed so far; (0, 0) if there are none."""
-        air = self._settings.air
+        air = self.settings.air
         if air != "auto":
             return (0, 0) if air == "none" else air
-        if not self._profiles:
+        if not self.profiles:
             return 0, 0
-        profiles, ids = np.concatenate(self._profiles), np.concatenate(self._surveyed)
-        columns = air_columns(profiles, self._dark.shape[1])
-        if not any(columns) or not np.isfinite(self._settings.sample_from):
+        profiles, ids = (np.concatenate(each) for each in zip(*self.profiles, strict=True))
+        columns = air_columns(profiles, self.dark.shape[1])
+        if not any(columns) or not np.isfinite(self.settings.sample_from):
             return columns
-        depth = edge_depth(profiles, ids, [position for position, _ in self._flats], columns)
-        return (0, 0) if depth > self._settings.sample_from else columns
+        depth = edge_depth(profiles, ids, [position for position, _ in self.flats], columns)
+        return (0, 0) if depth > self.settings.sample_from else columns
 
     def transmission(
         self,
         counts: NDArray[np.generic],
         positions: NDArray[np.float64],
-        view_ids: NDArray[np.int64] | None = None,
+        view_ids: NDArray[np.int64],
         progress: Callable[[int], None] = lambda done: None,
     ) -> Transmission:
         """(counts - dark) / (flat - dark) with bad pixels filled from their neighbours.
@@ -186,54 +179,58 @@ class Correction:
         Args:
             counts: [view, row, col], any real type, in the order of acquisition.
             positions: [view], number of the frame in the scan, as in the flats' positions.
-            view_ids: int64 [view]; None: 0, 1, 2 ...
+            view_ids: int64 [view].
             progress: how many views are done, after each.
 
         Raises:
             ValueError: for shapes that do not fit, positions or more than half of a view not finite.
         """
-        self._check_views(counts, positions)
-        ids = np.arange(len(counts), dtype=np.int64) if view_ids is None else np.asarray(view_ids, np.int64)
-        if ids.shape != counts.shape[:1]:
-            raise ValueError(f"view_ids must have shape {counts.shape[:1]}, got {ids.shape}")
+        _check_views(counts, positions, self.dark.shape)
+        if view_ids.shape != counts.shape[:1]:
+            raise ValueError(f"view_ids must have shape {counts.shape[:1]}, got {view_ids.shape}")
         data, repaired = np.empty(counts.shape, np.float32), np.zeros(len(counts), np.int64)
-        beam, runs = None if self._photons is None else np.empty(counts.shape, np.float32), [NO_RUNS]
+        beam, runs = None if self.photons is None else np.empty(counts.shape, np.float32), [NO_RUNS]
         for v, view in enumerate(data):
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                np.subtract(counts[v], self._dark, out=view, casting="unsafe")
+                np.subtract(counts[v], self.dark, out=view, casting="unsafe")
                 flat = self._flat_of(view, float(positions[v]))
                 view /= flat
-            if beam is not None and self._photons is not None:
-                np.divide(flat, np.float32(self._photons.gain), out=beam[v])
-                fill(beam[v], self._fill)
+            if beam is not None and self.photons is not None:
+                np.divide(flat, np.float32(self.photons.gain), out=beam[v])
+                fill(beam[v], self._filling)
             bad = ~np.isfinite(view) & ~self.masked
             repaired[v] = bad.sum()
             if repaired[v] > view.size / 2:
                 raise ValueError(
-                    f"view {ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
+                    f"view {view_ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
                 )
-            if (unseen := unmeasured(counts[v], view, self._hidden, self._foreign)) is not None:
-                runs.append(runs_of(unseen, int(ids[v])))
+            if (unseen := unmeasured(counts[v], view, self._hidden, self.foreign)) is not None:
+                runs.append(runs_of(unseen, int(view_ids[v])))
                 repaired[v] -= np.count_nonzero(bad & unseen)
                 bad |= unseen
-            fill(view, plan_fill(bad | self.masked) if repaired[v] or unseen is not None else self._fill)
+            fill(view, plan_fill(bad | self.masked) if repaired[v] or unseen is not None else self._filling)
             progress(v + 1)
-        return Transmission(data, ids, repaired, np.ones(len(data), np.float32), beam, np.concatenate(runs))
+        if self.light is not None:
+            light = self.light[view_ids].astype(np.float32)[:, None, None]
+            np.multiply(data, light, out=data)
+            if beam is not None:
+                np.divide(beam, light, out=beam)
+        return Transmission(data, view_ids, repaired, np.ones(len(data), np.float32), beam, np.concatenate(runs))
 
     def _flat_of(self, view: Image, position: float) -> Image:
         """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
-        between = flat_at(position, self._flats, self._part_starts)
-        if self._dynamic is None:
+        between = flat_at(position, self.flats, self.part_starts)
+        if self.dynamic is None:
             return between
         live = ~self.masked
-        level = between[live].mean() / self._dynamic.mean[live].mean()
-        return np.where(self.masked, np.float32(1), level * self._dynamic.flat_of(view / level, self._settings.floor))
+        level = between[live].mean() / self.dynamic.mean[live].mean()
+        return np.where(self.masked, np.float32(1), level * self.dynamic.flat_of(view / level, self.settings.floor))
 
-    def survey(self, views: Transmission) -> None:
-        """Use the views in the search for air columns."""
-        if self._settings.air == "auto":
-            self._profiles.append(edge_profiles(views.data))
-            self._surveyed.append(views.view_ids)
+    def surveyed(self, views: Transmission) -> CorrectionPlan:
+        """The plan by which these views, too, were used in the search for air columns; of all views, it has theirs."""
+        if self.settings.air != "auto":
+            return self
+        return replace(self, profiles=(*self.profiles, (edge_profiles(views.data), views.view_ids)))
 
     def line_integrals(
         self,
@@ -241,35 +238,20 @@ class Correction:
         last: bool = True,
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
-    ) -> Projections:
-        """Line integrals of these views and of the waiting one; without `last` the newest view then waits.
+    ) -> tuple[Projections, CorrectionPlan]:
+        """Line integrals of these views and of the waiting one, and the plan of the views that follow.
 
         Args:
             views: the next ones, whose memory the result takes over; None: the scan has ended with the waiting view.
-            last: no view comes after these.
+            last: no view comes after these; else the newest view waits.
             progress: how many views are free of spots, after each; the logarithm that follows takes little time.
             order: of their neighbours, see `SpotFilter.feed`.
 
         Raises:
             UnlitViewsError: the air columns of some views are dark; it has their numbers.
         """
-        settings, columns = self._settings, self.air_columns
-        if views is None:
-            none, empty = np.empty((0, *self._dark.shape), np.float32), np.empty(0, np.int64)
-            air = np.empty(0, np.float32)
-            views = Transmission(none, empty, empty, air, None if self._photons is None else none)
-        light = air_light(views.data, *columns)
-        air = light.mean(axis=1)
-        unlit = views.view_ids[~(light.min(axis=1) > settings.floor)]
-        if unlit.size:
-            raise UnlitViewsError(
-                f"no beam in {unlit.size} of {air.size} views ({unlit[:8].tolist()} ...): the air columns, "
-                f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
-            )
-        views.data[...] /= light[:, None]
-        beam = None if views.beam is None else views.beam * light[:, None]
-        views = self.spots.feed(replace(views, air=air, beam=beam), last, progress, order)
-        floored = 0
+        settings, columns, floored = self.settings, self.air_columns, 0
+        views, spots = self.spots.feed(views and self._levelled(views), last, progress, order)
         for v, view in enumerate(views.data):
             if views.beam is not None:
                 self._likelihood(view, views.beam[v])
@@ -279,48 +261,110 @@ class Correction:
             view[low] = settings.floor
             np.negative(np.log(view, out=view), out=view)
         live = max(int((~self.masked).sum()) * len(views.data), 1)
-        replaced, left = int(views.repaired.sum()) / live, self.spots.left
+        replaced = int(views.repaired.sum()) / live
         return Projections(
             views.data, views.view_ids, floored / live, views.air, self.masked, columns, replaced, views.beam,
-            views.unmeasured, left,
-        )  # fmt: skip
+            views.unmeasured, spots.left,
+        ), replace(self, spots=spots)  # fmt: skip
+
+    def _levelled(self, views: Transmission) -> Transmission:
+        """The views divided by their air, in place."""
+        light, columns = air_light(views.data, *self.air_columns), self.air_columns
+        unlit = views.view_ids[~(light.min(axis=1) > self.settings.floor)]
+        if unlit.size:
+            raise UnlitViewsError(
+                f"no beam in {unlit.size} of {len(light)} views ({unlit[:8].tolist()} ...): the air columns, "
+                f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
+            )
+        views.data[...] /= light[:, None]
+        beam = None if views.beam is None else views.beam * light[:, None]
+        return replace(views, air=light.mean(axis=1), beam=beam)
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
-        assert self._photons is not None
+        assert self.photons is not None
         light = beam.astype(np.float64)
-        extra = np.full(view.shape, self._photons.variance / self._photons.gain**2)
+        extra = np.full(view.shape, self.photons.variance / self.photons.gain**2)
         p, w = of_view(np.maximum(view * light, -extra), light, extra)
         view[...] = np.where(w > 0, p, 0)
         beam[...] = np.where(self.masked, 0, w)
 
-    def _check_views(self, counts: NDArray[np.generic], positions: NDArray[np.float64]) -> None:
-        if counts.ndim != 3 or counts.size == 0:
-            raise ValueError(f"counts must be [view, row, col] with at least one view, got shape {counts.shape}")
-        if counts.shape[1:] != self._dark.shape:
-            raise ValueError(f"the dark has shape {self._dark.shape}, the views {counts.shape[1:]}")
-        if np.shape(positions) != counts.shape[:1]:
-            raise ValueError(
-                f"positions must hold one number for each of {len(counts)} views, got shape {np.shape(positions)}"
-            )
-        if not np.isfinite(positions).all():
-            raise ValueError(
-                f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
-            )
+
+def survey(
+    references: References,
+    settings: CorrectionSettings | None = None,
+    masked: Mask | None = None,
+    standing: Mask | None = None,
+    **known: Any,
+) -> CorrectionPlan:
+    """The plan of views with these references.
+
+    Args:
+        references: darks and flats of the detector area of the views.
+        masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
+        standing: bool [row, col], pixels to fill besides, in the shadow of an object; None: none.
+        known: `photons`, `foreign` and `light` of the plan.
+
+    Raises:
+        ValueError: for shapes that do not fit, no flats, or no beam in the flats.
+    """
+    settings = CorrectionSettings() if settings is None else settings
+    check(references)
+    dark = np.asarray(references.dark, np.float32)
+    air, cols = settings.air, dark.shape[1]
+    if isinstance(air, tuple) and not (min(air) >= 0 and 0 < sum(air) <= cols):
+        raise ValueError(f"air columns (left, right) {air} do not fit {cols} columns")
+    if masked is not None and np.shape(masked) != dark.shape:
+        raise ValueError(f"masked must have shape {dark.shape}, got {np.shape(masked)}")
+    if masked is None:
+        masked = dead_pixels(dark, [flat for _, flat in references.flats], settings.hot_threshold)
+    masked = masked if standing is None else masked | standing
+    with np.errstate(invalid="ignore", over="ignore"):
+        flats = tuple(
+            (position, np.where(masked, np.float32(1), np.asarray(flat, np.float32) - dark))
+            for position, flat in sorted(references.flats, key=lambda group: group[0])
+        )
+    spots = SpotFilter(settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
+    return CorrectionPlan(settings, dark, flats, references.part_starts, references.dynamic, masked, spots, **known)
 
 
-class LineIntegralCorrection:
-    """Line integrals as they are given, as a `Correction` for its caller: pixels that are not finite or measured
-    nothing, and spots, are filled. There is no air, and nothing is masked but pixels [row, col] that no view has.
-    Exact zeros at the corners are measured where air is 0 without noise."""
+def _check_views(counts: NDArray[np.generic], positions: NDArray[np.float64], shape: tuple[int, ...]) -> None:
+    if counts.ndim != 3 or counts.size == 0:
+        raise ValueError(f"counts must be [view, row, col] with at least one view, got shape {counts.shape}")
+    if counts.shape[1:] != shape:
+        raise ValueError(f"the dark has shape {shape}, the views {counts.shape[1:]}")
+    if np.shape(positions) != counts.shape[:1]:
+        raise ValueError(
+            f"positions must hold one number for each of {len(counts)} views, got shape {np.shape(positions)}"
+        )
+    if not np.isfinite(positions).all():
+        raise ValueError(
+            f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
+        )
 
-    air_columns = (0, 0)
 
-    def __init__(self, zinger_threshold: float, foreign: Mask | None = None) -> None:
-        """`foreign`: as of a `Correction`."""
-        self.masked: Mask = np.ones((1, 1), np.bool_)
-        self._foreign = foreign
-        self.spots = SpotFilter(zinger_threshold, lambda lines: np.exp(np.clip(lines, -_DEEPEST, _DEEPEST) / -2))
+@dataclass(frozen=True, eq=False)
+class LinesPlan:
+    """The plan of views that are line integrals already, which is used as a `CorrectionPlan` is.
+
+    Pixels that are not finite or measured nothing, and spots, are filled. There is no air, and nothing is masked but
+    pixels that no view has. Exact zeros at the corners are measured where air is 0 without noise.
+
+    Attributes:
+        spots, foreign: as of a `CorrectionPlan`.
+        masked: bool [row, col], pixels that are finite in none of the views so far.
+    """
+
+    spots: SpotFilter
+    foreign: Mask | None = None
+    masked: Mask = field(default_factory=lambda: np.ones((1, 1), np.bool_))
+    air_columns: ClassVar[tuple[int, int]] = (0, 0)
+
+    @classmethod
+    def of(cls, zinger_threshold: float, foreign: Mask | None = None) -> LinesPlan:
+        """The plan before the first view; the threshold is that of `CorrectionSettings`."""
+        root = SpotFilter(zinger_threshold, lambda lines: np.exp(np.clip(lines, -_DEEPEST, _DEEPEST) / -2))
+        return cls(root, foreign)
 
     def transmission(
         self,
@@ -337,18 +381,19 @@ class LineIntegralCorrection:
             light = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
             light[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
             lost = bad[v]
-            if (unseen := unmeasured(view, light, hidden, self._foreign)) is not None:
+            if (unseen := unmeasured(view, light, hidden, self.foreign)) is not None:
                 runs.append(runs_of(unseen, int(view_ids[v])))
                 lost, repaired[v] = lost | unseen, -np.count_nonzero(lost & unseen)
             repaired[v] += np.count_nonzero(bad[v])
             if lost.any():
                 nearest = ndimage.distance_transform_edt(lost, return_distances=False, return_indices=True)
                 view[...] = view[tuple(nearest)]
-        self.masked = self.masked & bad.all(axis=0)
-        return Transmission(data, view_ids, repaired, np.ones(len(data), np.float32), unmeasured=np.concatenate(runs))
+        ones = np.ones(len(data), np.float32)
+        return Transmission(data, view_ids, repaired, ones, None, np.concatenate(runs), bad.min(axis=0, initial=True))
 
-    def survey(self, views: Transmission) -> None:
-        """There is no air to be found."""
+    def surveyed(self, views: Transmission) -> LinesPlan:
+        """The plan that masks what none of these views has either."""
+        return self if views.unseen is None else replace(self, masked=self.masked & views.unseen)
 
     def line_integrals(
         self,
@@ -356,29 +401,50 @@ class LineIntegralCorrection:
         last: bool = True,
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
-    ) -> Projections:
-        """As of a `Correction`."""
-        if views is None:
-            none, empty = np.empty((0, *self.masked.shape), np.float32), np.empty(0, np.int64)
-            views = Transmission(none, empty, empty, np.empty(0, np.float32))
-        views = self.spots.feed(views, last, progress, order)
+    ) -> tuple[Projections, LinesPlan]:
+        """As of a `CorrectionPlan`."""
+        views, spots = self.spots.feed(views, last, progress, order)
         replaced = float(views.repaired.sum()) / max(views.data.size, 1)
         return Projections(
             views.data, views.view_ids, 0.0, views.air, self.masked, replaced=replaced, unmeasured=views.unmeasured,
-            spots_left=self.spots.left,
-        )  # fmt: skip
+            spots_left=spots.left,
+        ), replace(self, spots=spots)  # fmt: skip
 
 
-def provisional(correction: Correction | LineIntegralCorrection) -> Projections | None:
-    """Line integrals of the view that waits for the next one, as if none followed; None if no view waits.
+Plan = CorrectionPlan | LinesPlan
 
-    It keeps waiting, because all its spots show only beside both neighbours.
+
+def apply(
+    frames: NDArray[np.generic],
+    positions: NDArray[np.float64],
+    plan: Plan,
+    view_ids: NDArray[np.int64],
+    *,
+    last: bool = True,
+    progress: Callable[[int], None] = lambda done: None,
+    order: NDArray[np.intp] | None = None,
+) -> tuple[Projections, Plan]:
+    """Line integrals, and weights where photons are counted, of the next views; and the plan of those that follow.
+
+    The plan that is given stays as it is, and with the same plan the same frames have the same line integrals.
+
+    Args:
+        frames: [view, row, col], any real type, in the order of acquisition; may be none where `last`. Line integrals
+            in float32 are taken over.
+        positions: [view], number of the frame in the scan, as in the flats' positions.
+        view_ids: int64 [view].
+        last: no view comes after these; else the newest view waits.
+        progress: how many of two steps a view are done.
+        order: of their neighbours, see `SpotFilter.feed`.
+
+    Raises:
+        ValueError: as of `CorrectionPlan.transmission`.
+        UnlitViewsError: the air columns of some views are dark; it has their numbers.
     """
-    if not correction.spots.waiting:
-        return None
-    spots, lines = copy(correction.spots), correction.line_integrals(None)
-    correction.spots = spots
-    return lines
+    if not len(view_ids):
+        return plan.line_integrals(None, last)
+    views = plan.transmission(frames, positions, view_ids, progress)
+    return plan.surveyed(views).line_integrals(views, last, lambda done: progress(len(view_ids) + done), order)
 
 
 def correct(
@@ -389,18 +455,16 @@ def correct(
     view_ids: ArrayLike | None = None,
     masked: Mask | None = None,
 ) -> Projections:
-    """Line integrals -log((counts - dark) / (flat - dark)) of a stack of views, by a `Correction` fed at once.
+    """Line integrals -log((counts - dark) / (flat - dark)) of a stack of views, surveyed and corrected at once.
 
     All results are finite: dead pixels and single bad values take the mean of their good neighbours and are counted.
-    Memory beyond the result: a few frames. Arguments and errors are those of `Correction` and of its `transmission`.
+    Memory beyond the result: a few frames. Arguments and errors are those of `survey` and of
+    `CorrectionPlan.transmission`.
     """
     counts = without_mask(counts)
     check_arguments(correct, locals())
-    correction = Correction(references, settings, masked)
-    ids = None if view_ids is None else np.asarray(view_ids, np.int64)
-    views = correction.transmission(counts, np.asarray(positions, np.float64), ids)
-    correction.survey(views)
-    return correction.line_integrals(views)
+    ids = np.arange(len(counts), dtype=np.int64) if view_ids is None else np.asarray(view_ids, np.int64)
+    return apply(counts, np.asarray(positions, np.float64), survey(references, settings, masked), ids)[0]
 
 
 def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None = None) -> Projections:

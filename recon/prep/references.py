@@ -96,7 +96,7 @@ def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
     return image + (exposure - first) / (second - first) * (other - image)
 
 
-def flat_at(position: float, groups: list[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
+def flat_at(position: float, groups: Sequence[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
     """Flat without its dark at a frame's position: interpolated between groups of its part, beyond them the nearest."""
     part = bisect_right(part_starts, position)
     own = [group for group in groups if bisect_right(part_starts, group[0]) == part]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,7 @@ class Transmission:
         air: float32 [view], transmission of the air by which each view was divided; 1 before.
         beam: float32 [view, row, col], photons without the sample; None: photons are not counted.
         unmeasured: int64 [run, 4], pixels that measured nothing, filled from their neighbours, see `runs_of`.
+        unseen: bool [row, col], pixels that are finite in none of the views of this batch; None: not looked for.
     """
 
     data: F32
@@ -42,8 +43,9 @@ class Transmission:
     air: F32
     beam: F32 | None = None
     unmeasured: I64 = field(default_factory=NO_RUNS.copy)
+    unseen: Mask | None = None
 
-    def __getitem__(self, part: slice | NDArray[np.intp]) -> Transmission:
+    def __getitem__(self, part: slice | NDArray[np.intp] | list[int]) -> Transmission:
         """Some of the views."""
         ids, beam = self.view_ids[part], None if self.beam is None else self.beam[part]
         runs = self.unmeasured[np.isin(self.unmeasured[:, 0], ids)]
@@ -56,63 +58,61 @@ class Transmission:
         return Transmission(*joined)
 
 
+@dataclass(frozen=True, eq=False)
 class SpotFilter:
     """Fills spots of views that come in batches of any size, each view between its neighbours in angle or time.
 
     The newest view waits for the next one. The result is the same to the bit for any split into batches.
 
     Attributes:
+        threshold: see `spots`; inf fills none.
+        root: √transmission of the pixels of a view, where the noise of photons is everywhere the same.
+        before: the last view that was freed of spots, as `root` reads it; None: there is none.
+        waiting: the newest view, which waits for the one after it; None: none waits.
         left: pixels of spots that were too large to be filled, in all views so far.
     """
 
-    def __init__(self, threshold: float, root: Callable[[F32], F32]) -> None:
-        """Take how views are read.
-
-        Args:
-            threshold: see `spots`; inf fills none.
-            root: √transmission of the pixels of a view, where the noise of photons is everywhere the same.
-        """
-        self._threshold, self._root = threshold, root
-        self._before: Image | None = None  # the last view that was freed of spots, as `root` reads it
-        self._waiting: Transmission | None = None
-        self.left = 0
-
-    @property
-    def waiting(self) -> bool:
-        """Whether the newest view waits for the one after it."""
-        return self._waiting is not None
+    threshold: float
+    root: Callable[[F32], F32]
+    before: Image | None = None
+    waiting: Transmission | None = None
+    left: int = 0
 
     def feed(
         self,
-        views: Transmission,
+        views: Transmission | None,
         last: bool = True,
         progress: Callable[[int], None] = lambda done: None,
         order: NDArray[np.intp] | None = None,
-    ) -> Transmission:
-        """The waiting view and these, their spots filled in place; without `last` the newest then waits.
+    ) -> tuple[Transmission, SpotFilter]:
+        """The waiting view and these, their spots filled in place; and the filter of the views that follow.
 
         Args:
+            views: the next ones; None: there are none after the waiting one.
+            last: no view comes after these; else the newest then waits.
             progress: how many views are done, after each.
             order: [view], where each view has its neighbours, beside it; all views are there, and none waits. None:
                 their neighbours are those before and after.
         """
-        views = views if self._waiting is None else self._waiting.and_then(views)
-        total = len(views.data)
+        if self.waiting is not None:
+            views = self.waiting[[0]] if views is None else self.waiting.and_then(views)
+        assert views is not None
+        total, before, left = len(views.data), self.before, self.left
         n, order = total if last else max(total - 1, 0), np.arange(total) if order is None else order
-        here = self._root(views.data[order[0]]) if n else None
+        here = self.root(views.data[order[0]]) if n else None
         for done, view in enumerate(order[:n], 1):
-            after = self._root(views.data[order[done]]) if done < total else None
-            if here is not None and np.isfinite(self._threshold):
-                found, left = spots(here, self._before, after, self._threshold)
-                self.left += left
+            after = self.root(views.data[order[done]]) if done < total else None
+            if here is not None and np.isfinite(self.threshold):
+                found, large = spots(here, before, after, self.threshold)
+                left += large
                 if found.any():
                     views.repaired[view] += found.sum()
                     fill(views.data[view], plan_fill(found))
-                    here = self._root(views.data[view])
-            self._before, here = here, after
+                    here = self.root(views.data[view])
+            before, here = here, after
             progress(done)
-        self._waiting = views[np.arange(n, total)] if n < total else None
-        return views[:n]
+        waiting = views[np.arange(n, total)] if n < total else None
+        return views[:n], replace(self, before=before, waiting=waiting, left=left)
 
 
 def without_spots(frames: Iterable[NDArray[Any]], light: float) -> Iterator[tuple[NDArray[Any], int]]:

@@ -13,6 +13,7 @@ from recon.base.arrays import F32
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
 from recon.base.registry import loaded
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.engine import Active
 from recon.kernels.fused_step import FusedStep, StepInputs, StepModel, StepPlan
@@ -57,19 +58,10 @@ class FitState:
 
 
 def problem_of(
-    projections: F32,
-    geometry: Geometry,
-    grid: Grid,
-    unit: float,
-    settings: FitSettings,
-    backend: Backend[Any] | None = None,
-    weights: F32 | None = None,
+    views: Views, grid: Grid, unit: float, settings: FitSettings, backend: Backend[Any] | None = None
 ) -> FitProblem:
     """The problem for these settings; see `make_problem`. None computes on the CPU."""
-    return make_problem(
-        projections, geometry, grid, unit, backend or Cpu(),
-        weights=weights, loss=settings.loss, ssim_weight=settings.ssim_weight,
-    )  # fmt: skip
+    return make_problem(views, grid, unit, backend or Cpu(), loss=settings.loss, ssim_weight=settings.ssim_weight)
 
 
 def init(

@@ -67,34 +67,24 @@ class FitProblem:
 
 
 def make_problem(
-    projections: F32,
-    geometry: Geometry,
-    grid: Grid,
-    unit: float,
-    backend: Backend[Any],
-    *,
-    weights: F32 | None = None,
-    loss: Loss = "l1",
-    ssim_weight: float = 0.25,
+    views: Views, grid: Grid, unit: float, backend: Backend[Any], *, loss: Loss = "l1", ssim_weight: float = 0.25
 ) -> FitProblem:
-    """Normalise projections [view, row, col] for a fit in density unit `unit` (1/mm).
+    """Normalise views for a fit in density unit `unit` (1/mm).
 
     Values that are not finite, or more than a million half fields times density units, get no weight, see
     `masks.masked`. The squared losses are scaled to the size of the absolute one at the data's noise (see
     `noise_level`). So the weights of SSIM and total variation keep their meaning.
 
-    Args:
-        weights: of each ray [view, row, col], 0 or more; None: one for all.
-
     Raises:
         ValueError: where shapes disagree, a view has no value that can be used, or the loss is unknown.
     """
-    require_views(geometry, projections)
+    geometry = views.geometry
+    require_views(geometry, views.data)
     if loss not in _KINDS:
         raise ValueError(f"loss must be one of {get_args(Loss)}, got {loss!r}")
     half_field = max(n * edge for n, edge in zip(grid.shape, grid.spacing, strict=True)) / 2
     scale = half_field * unit
-    filled, known = masked(projections, weights, _LARGEST * scale)
+    filled, known = masked(views.data, views.weights, _LARGEST * scale)
     delta = max(noise_level(filled) / scale, 1e-4)
     projection_loss = backend.projection_loss(
         geometry.detector_shape, ssim_weight, DataTerm(_KINDS[loss], delta, scale)

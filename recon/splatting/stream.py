@@ -24,6 +24,7 @@ from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry, unseen_axis
 from recon.base.method import Clock, Progress
 from recon.base.units import look_like_degrees, warn_of_degrees
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.splatting import optimise as fit
 from recon.splatting.anytime import (
@@ -391,7 +392,7 @@ class StreamingFit:
         every, data = self._template.at(self._angles), np.stack(self._data)
         learnt = [view for view in range(self.n_views) if all_views or not self._held_out[view]]
         geometry, seen = every.select(learnt), data[learnt]
-        wider = sample_radius(data, every)
+        wider = sample_radius(Views(data, every))
         box = self._grid if wider is None else self._grid.reaching(wider.radius, self._template)
         field = Grid.for_fit(self._template, box, wider=wider is not None)
         coarser = 2 ** max(0, math.ceil(math.log2(math.prod(field.shape) / PLACED_FROM) / 3))
@@ -411,7 +412,7 @@ class StreamingFit:
             radius = geometry.reach if wider is None else math.inf
             placed = sample_gaussians(volume, count, self._rng, field_radius=radius, kernel=kernel)
             placed = scale_to_data(placed, seen, geometry)
-        self._problem = fit.problem_of(data, every, field, placed.density_unit, self._settings)
+        self._problem = fit.problem_of(Views(data, every), field, placed.density_unit, self._settings)
         self._state, self._schedule_step = fit.init(placed, self._rng), 0
         self._placed = placed.n
         self._data, self._unseen = [], []  # the problem holds them from now on

@@ -110,7 +110,7 @@ class _FitViews:
             return None
         geometry = self.kept_back.geometry.at_row(0).seen_with(self.seen.geometry.width)
         views = join_pixels(replace(self.kept_back, geometry=geometry), self.joined)
-        return fit.problem_of(views.data, views.geometry, self.field, unit, settings, problem.backend, views.weights)
+        return fit.problem_of(views, self.field, unit, settings, problem.backend)
 
 
 def _of_steps(geometry: Geometry, device: str) -> Geometry:
@@ -246,9 +246,7 @@ def _started(
         state = fit.init(start, problem.seed, growth(settings), backend)
     else:
         state = _resumed(control.resume, problem.geometry.n_views, backend)
-    fitting = fit.problem_of(
-        views.seen.data, views.seen.geometry, views.field, state.unit, settings, backend, views.seen.weights
-    )
+    fitting = fit.problem_of(views.seen, views.field, state.unit, settings, backend)
     if settings.tv_weight is None:
         change = decide(
             "change", lambda: mean_change(views.seen.data, views.seen.geometry, views.field, first, problem.device)

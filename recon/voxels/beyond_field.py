@@ -18,7 +18,7 @@ from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions
 from recon.base.empirical import LIGHT_WEIGHT
 from recon.base.geometry import Geometry
-from recon.base.masks import RayWeights, masked
+from recon.base.masks import masked
 from recon.base.method import SAMPLE, Method, ReconProblem, Reconstruction, RunControl, SampleRadius
 from recon.base.view_data import Views
 from recon.base.views import spread_views
@@ -61,7 +61,7 @@ def run_on_extended_grid(method: Method, problem: ReconProblem, control: RunCont
     data, views, grid = problem.projections, problem.geometry, problem.grid
 
     def measured() -> list[float]:
-        sample = sample_radius(data, views, problem.views.weights, problem.use.sample_radius)
+        sample = sample_radius(problem.views, problem.use.sample_radius)
         return [] if sample is None else list(asdict(sample).values())
 
     sample = SampleRadius(*values) if (values := decide(SAMPLE, measured)) else None
@@ -91,12 +91,7 @@ class _Outside:
         return Projector(views, self.box).forward(matter)
 
 
-def sample_radius(
-    projections: F32,
-    geometry: Geometry,
-    weights: F32 | RayWeights | None = None,
-    given: float | SampleRadius | None = None,
-) -> SampleRadius | None:
+def sample_radius(views: Views, given: float | SampleRadius | None = None) -> SampleRadius | None:
     """How far the sample reaches; None: not beyond the field. Of fewer than 16 views the end that FBP takes.
 
     FISTA-TV with a light weight explains seven of eight views of some binned rows, in boxes that are wider and wider,
@@ -105,27 +100,24 @@ def sample_radius(
     the search errs to the short side, and where it is right, densities change by 2 %.
 
     Args:
-        projections: line integrals [view, row, col]; only some rows of some views are read.
-        weights: of the rays; those of weight 0 do not count.
+        views: only some rows of some views are read; rays of weight 0 do not count.
         given: mm, the radius where that is known.
     """
-    reach = geometry.reach
+    geometry = views.geometry
+    own, reach = geometry.ordinary, geometry.reach
     if given is not None:
         return _given_radius(given, reach)
-    own = geometry.ordinary
     used = np.flatnonzero(own)
     some = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
-    measured = _some_rows(projections, geometry, weights, some)
-    if measured is None:
+    if (measured := _some_rows(views, some)) is None:
         return None
-    views, geometry = measured
-    used = np.flatnonzero(geometry.ordinary)
-    if not wider_than_field(views[used], geometry.select(used)):
+    ordinary = measured.select(np.flatnonzero(measured.geometry.ordinary))
+    if not wider_than_field(ordinary.data, ordinary.geometry):
         return None
-    if used.size < LEAST_VIEWS:
-        ends = sample_reach(views[used].mean(axis=0), geometry.axis_col) * geometry.sample_pitch
+    if ordinary.geometry.n_views < LEAST_VIEWS:
+        ends = sample_reach(ordinary.data.mean(axis=0), geometry.axis_col) * geometry.sample_pitch
         return SampleRadius(float(np.clip(np.median(ends), reach, _WIDEST * reach)), reach, _WIDEST * reach, 1.0)
-    return _predicting_radius(views, geometry, reach)
+    return _predicting_radius(measured, reach)
 
 
 def offset_error(volume: Volume, geometry: Geometry, sample: SampleRadius | None) -> float:
@@ -155,9 +147,9 @@ def _given_radius(given: float | SampleRadius, reach: float) -> SampleRadius | N
     return SampleRadius(given, given, given, 0.0) if given > reach else None
 
 
-def _predicting_radius(views: F32, geometry: Geometry, reach: float) -> SampleRadius | None:
+def _predicting_radius(views: Views, reach: float) -> SampleRadius | None:
     """The radius whose volume predicts views held out best; `reach`: of the whole detector."""
-    trial = _Trial.of(views, geometry, _COLS)
+    trial = _Trial.of(views, _COLS)
     tried: dict[float, tuple[F64, float]] = {}
 
     def best(ratios: Iterable[float]) -> float:
@@ -169,7 +161,7 @@ def _predicting_radius(views: F32, geometry: Geometry, reach: float) -> SampleRa
     first = best(_STEP**k for k in range(1 + math.floor(math.log(_WIDEST, _STEP))))
     least = best(first * _FINE**k for k in (-3, -2, -1, 1, 2, 3) if first * _FINE**k >= 1)
     if least < _STEP:  # coarse voxels blur where the field ends
-        trial = _Trial.of(views, geometry, 2 * _COLS)
+        trial = _Trial.of(views, 2 * _COLS)
         tried.clear()
         least = best(_FINE ** (k / 2) for k in range(8))
     if predicts_as_well(tried[1.0][0], tried[least][0]):
@@ -188,12 +180,10 @@ def _factor(geometry: Geometry, columns: int) -> int:
     return max(1, min(rows, math.ceil(cols / columns)))
 
 
-def _some_rows(
-    data: F32, geometry: Geometry, weights: F32 | RayWeights | None, some: NDArray[np.intp]
-) -> tuple[F32, Geometry] | None:
+def _some_rows(whole: Views, some: NDArray[np.intp]) -> Views | None:
     """The measured ones of these views, in the rows with most matter, of a cone in those in its middle; None: none."""
-    geometry = geometry.select(some)
-    look = np.nan_to_num(data[some[:: max(1, len(some) // _LOOKS)]], nan=0.0, posinf=0.0, neginf=0.0)
+    geometry = whole.geometry.select(some)
+    look = np.nan_to_num(whole.data[some[:: max(1, len(some) // _LOOKS)]], nan=0.0, posinf=0.0, neginf=0.0)
     height = _ROWS * _factor(geometry, _COLS)
     rows = slice(0, geometry.detector_shape[0])
     if not geometry.is_cone:
@@ -201,13 +191,14 @@ def _some_rows(
         geometry = geometry.rows(rows.start, rows.stop)
     elif (middle := middle_of_cone(geometry, Grid.matching(geometry), look, height)) is not None:
         rows, geometry = middle[:2]
-    views = np.stack([data[view, rows] for view in some])
+    views = np.stack([whole.data[view, rows] for view in some])
     known = np.isfinite(views)
-    if weights is not None:
-        known &= np.stack([weights[view, rows] for view in some]) > 0
+    if whole.weights is not None:
+        known &= np.stack([whole.weights[view, rows] for view in some]) > 0
     if not (seen := np.flatnonzero(known.any(axis=(1, 2)))).size:
         return None
-    return masked(views[seen], known[seen].astype(np.float32))[0], geometry.select(seen)
+    filled, _ = masked(views[seen], known[seen].astype(np.float32))
+    return Views(filled, geometry.select(seen))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,10 +215,10 @@ class _Trial:
     box: Grid
 
     @classmethod
-    def of(cls, views: F32, geometry: Geometry, columns: int) -> _Trial:
-        binned = Views(views, geometry).binned(_factor(geometry, columns))
+    def of(cls, views: Views, columns: int) -> _Trial:
+        binned = views.binned(_factor(views.geometry, columns))
         box = Grid.matching(binned.geometry)
-        if not geometry.is_cone:
+        if not views.geometry.is_cone:
             geometry, box = slab_of(binned.geometry, box, 0, binned.geometry.detector_shape[0])
             binned = Views(binned.data, geometry)
         return cls(*binned.split(), box)

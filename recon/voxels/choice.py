@@ -46,18 +46,6 @@ def significantly_better(residuals: F64, other: F64, least_gain: float) -> bool:
     return by_more and exceeds_standard_error(other - residuals, _ERRORS)
 
 
-def simplest_within_one_se(residuals: Sequence[F64 | None], least_gain: float = LEAST_GAIN) -> int | None:
-    """Number of the first candidate, and so the simplest, that the best one does not beat; None: none was tried.
-
-    One with a residual that is not finite was ended, or diverged, and counts as not tried.
-    """
-    tried = {at: each for at, each in enumerate(residuals) if each is not None and np.isfinite(each).all()}
-    if not tried:
-        return None
-    best = min(tried.values(), key=lambda each: float(each.mean()))
-    return next(at for at, each in tried.items() if not significantly_better(best, each, least_gain))
-
-
 class Prediction(NamedTuple):
     """What the volume of a candidate leaves of the views held out.
 
@@ -99,20 +87,42 @@ class TrialChoice(NamedTuple):
         return self._replace(predictions=(*self.predictions, prediction))
 
     @property
-    def residuals(self) -> list[F64 | None]:
-        """[candidate] residuals [view held out]; None: not tried."""
-        return [None if each.residuals is None else np.asarray(each.residuals) for each in self.predictions]
+    def tried(self) -> dict[int, F64]:
+        """Residuals [view held out] of the candidates that were tried, by number.
+
+        One with a residual that is not finite was ended, or diverged, and counts as not tried.
+        """
+        given = {at: each.residuals for at, each in enumerate(self.predictions) if each.residuals is not None}
+        return {at: np.asarray(left) for at, left in given.items() if np.isfinite(left).all()}
 
     @property
-    def at(self) -> int | None:
-        """Number of the simplest candidate that the best does not beat; None: none was tried."""
-        return simplest_within_one_se(self.residuals, self.least_gain)
+    def best(self) -> int | None:
+        """Number of the candidate of least mean residual; None: none was tried."""
+        tried = self.tried
+        return min(tried, key=lambda at: float(tried[at].mean()), default=None)
 
     @property
     def least(self) -> F64 | None:
         """The residuals of the least mean; None: none was tried."""
-        tried = [each for each in self.residuals if each is not None and np.isfinite(each).all()]
-        return min(tried, key=lambda each: float(each.mean()), default=None)
+        return None if self.best is None else self.tried[self.best]
+
+    @property
+    def at(self) -> int | None:
+        """Number of the first candidate, and so the simplest, that the best does not beat; None: none was tried."""
+        if (least := self.least) is None:
+            return None
+        return next(at for at, each in self.tried.items() if not significantly_better(least, each, self.least_gain))
+
+    @property
+    def verdicts(self) -> list[str]:
+        """[candidate] "best"; "alike", which predicts as well but for chance; or empty. All are empty where the best
+        lowers the residual of no other one by `least_gain`."""
+        tried, least, words = self.tried, self.least, [""] * len(self.predictions)
+        if least is None or all((1 - self.least_gain) * each.mean() <= least.mean() for each in tried.values()):
+            return words
+        for at, each in tried.items():
+            words[at] = "best" if at == self.best else "alike" * predicts_as_well(each, least)
+        return words
 
     @property
     def prior(self) -> Prior | None:
@@ -125,8 +135,8 @@ class TrialChoice(NamedTuple):
         remarks."""
         if self.at is None:
             return self.where
-        named = zip(self.predictions, self.residuals, strict=True)
-        listed = [f"{each.name} {left.mean():.4g}" for each, left in named if left is not None]
+        given = [(each.name, np.mean(each.residuals)) for each in self.predictions if each.residuals is not None]
+        listed = [f"{name} {mean:.4g}" for name, mean in given]
         remarks = [each.remark for each in self.predictions if each.remark]
         return f"trials on {self.where}, {_MEASURE}: {'; '.join([*listed, *remarks])}"
 

@@ -12,7 +12,6 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 
 from recon.base.arrays import F32, Mask, bin_views
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
 from recon.base.noise import air_level, noise_level, ring_offsets
 from recon.base.slabs import part_of
 from recon.base.view_data import Views
@@ -112,12 +111,11 @@ def seen_empty(views: Views, grid: Grid) -> tuple[Mask, Mask]:
     A ray meets none where its line integral, blurred by a pixel, is within four standard deviations of the noise, or
     within 0.5 % of the thick parts. So matter much thinner than that counts as none.
     """
-    projections, geometry, weights = views.data, views.geometry, views.weights
-    some = spread(np.arange(geometry.n_views), _VIEWS)
-    data, known = masked(projections[some], None if weights is None else weights[some])
+    part = views.select(spread(np.arange(views.geometry.n_views), _VIEWS)).masked()
+    data, known = part.data, part.weights
     noise = noise_level(data) / (2 * math.sqrt(math.pi) * _BLUR)  # after the blur
     limit = max(_SIGMAS * noise, _LEAST * float(np.percentile(data, 99)))
-    geometry = replace(geometry.select(some), skew=0.0) if geometry.skew else geometry.select(some)
+    geometry = replace(part.geometry, skew=0.0) if part.geometry.skew else part.geometry
     votes, by_all = np.zeros(grid.shape, np.int16), np.ones(grid.shape, bool)
     for view, image in enumerate(data):
         air = gaussian_filter(image, _BLUR) < limit

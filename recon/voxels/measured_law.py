@@ -24,7 +24,7 @@ from recon.base.arrays import F32, bin_views
 from recon.base.decisions import Decisions
 from recon.base.error_law import ErrorLaw
 from recon.base.geometry import Geometry
-from recon.base.view_data import split_views
+from recon.base.view_data import Views, split_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.beyond_field import offset_error, sample_radius
 from recon.voxels.choice import preferred_strength
@@ -76,7 +76,7 @@ def measured_law(
             f"{n} views and {len(open_beam)} frames of the open beam are there, "
             f"{LEAST_VIEWS} and {_LEAST_FRAMES} needed to measure the law of the error"
         )
-    sample = sample_radius(data, geometry)
+    sample = sample_radius(Views(data, geometry))
     width = 1.0 if sample is None else sample.radius / geometry.reach  # of the sample, over the field's
     slab = _Slab.of(data, geometry, width, open_beam)
     most, held_out = split_views(slab.geometry)

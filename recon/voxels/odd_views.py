@@ -138,14 +138,14 @@ def _differences(volume: Volume, whole: Views, side: int, progress: Callable[[in
 
     [view, cell, cell] each, averaged over cells, in standard deviations of noise.
     """
-    projections, geometry, weights = whole.data, whole.geometry, whole.weights
+    geometry, weights = whole.geometry, whole.weights
     rows, cols = (n // side for n in geometry.detector_shape)
     # Means over cells: the difference in light, its part explained by edges, the known pixels, the view in light, the
     # light, and the difference.
     cells, edges, lit, seen, light, left = (np.zeros((geometry.n_views, rows, cols), np.float32) for _ in range(6))
     compared = 0
     for views, part, model, sharp in _projected(volume, geometry):
-        measured = projections[views, part]
+        measured = whole.data[views, part]
         difference = measured - model
         known = np.ones_like(model) if weights is None else (weights[views, part] > 0).astype(np.float32)
         bright = np.sqrt(np.exp(-np.clip(measured, 0, 20))) * known

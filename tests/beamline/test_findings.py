@@ -28,6 +28,7 @@ from beamline.projections.replay import by_kind, replay, verdict
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.evidence import ScanEvidence
 from tests.beamline.attacked_scans import SCANS
 from tests.beamline.prepared_views import prepare
 from tests.bench.clean_scans import clean_scan
@@ -62,7 +63,8 @@ def of_source(source: ScanSource, axis: float | None = None) -> list[Row]:
     whole = verdict(source, judged)
     rows += [["monitor", "references", "", "", sentence] for sentence in whole.references]
     rows += [["monitor", "left out", "", "", sentence] for sentence in whole.aside]
-    found = dict.fromkeys([*source_findings(source), *views_lit(source, every=True)])
+    scan = ScanEvidence(source)
+    found = dict.fromkeys([*source_findings(scan), *views_lit(scan, every=True)])
     rows += [["validate", each.rule, each.severity, "", each.message] for each in found]
     return rows + prepared(source, axis)
 

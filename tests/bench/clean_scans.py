@@ -18,6 +18,7 @@ from beamline.core.errors import DataError
 from beamline.features.files.validate import source_findings
 from beamline.projections.selection import Selection
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from tests.beamline.array_source import ArraySource
 from tests.beamline.prepared_views import prepare
 
@@ -140,7 +141,11 @@ def clean_scan(seed: int, change: Change = lambda t, balls: balls, **fixed: obje
 
 def told_of(source: ArraySource) -> list[str]:
     """What a reconstruction, `validate` and `info` say of a scan, without what is said of every one."""
-    told = [finding.message for finding in source_findings(cast(ScanSource, source)) if finding.severity != "info"]
+    told = [
+        finding.message
+        for finding in source_findings(ScanEvidence(cast(ScanSource, source)))
+        if finding.severity != "info"
+    ]
     try:
         told += prepare(source, Selection(axis_col=source.axis_col))[1]
     except DataError as error:

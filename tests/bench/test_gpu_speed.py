@@ -12,6 +12,7 @@ import torch
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import RayModel
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
@@ -65,7 +66,7 @@ def test_a_step_and_thirty_thousand(n: int, side: int) -> None:
     seen = backend.begin(means, scales, quaternions, raw, 1.0)
     images = (seen.view(views, view, 1e-3, 3.5, RayModel()).image for view in range(50))
     data = np.stack([backend.numpy(image) for image in images])
-    problem = fit.problem_of(data, views, Grid.matching(views), 1.0, settings, backend)
+    problem = fit.problem_of(Views(data, views), Grid.matching(views), 1.0, settings, backend)
     state = fit.init(_model(n, 0.86 * side), 0, backend=backend)
     torch.cuda.reset_peak_memory_stats()
     middle, spread = _median_ms(lambda: fit.step(state, problem, settings, 0.9))

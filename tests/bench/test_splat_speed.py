@@ -19,6 +19,7 @@ from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.kernels.cpu import lanes
 from recon.kernels.cpu.activation import OPTIONS
@@ -157,7 +158,7 @@ def test_a_whole_step_and_its_parts() -> None:
     noise = np.random.default_rng(2).normal(1, 0.05, (4, SIDE, SIDE)).astype(np.float32)
     data = project(g, views).numpy() * noise
     settings = FitSettings(policy=None, views_per_step=1)
-    problem = fit.problem_of(data, views, Grid.matching(views), g.density_unit, settings)
+    problem = fit.problem_of(Views(data, views), Grid.matching(views), g.density_unit, settings)
     state = fit.init(g, 0)
     p, unit, n = state.parameters, 1 / problem.half_field, state.n
     step = _times(lambda: fit.step(state, problem, settings, 0.3, view=2))
@@ -190,7 +191,7 @@ def test_a_whole_fit_of_published_length(steps: int, side: int) -> None:
     data = project(g, views).numpy() * np.random.default_rng(2).normal(1, 0.02, (50, side, side)).astype(np.float32)
     settings = FitSettings(views_per_step=1, pace=1.0, tv_size=32, policy=DensityPolicy(growth=1.0))
     warm_up()
-    problem = fit.problem_of(data, views, Grid.matching(views), g.density_unit, settings)
+    problem = fit.problem_of(Views(data, views), Grid.matching(views), g.density_unit, settings)
     start = replace(g, means=g.means + 0.3 * torch.randn(g.means.shape, generator=torch.Generator().manual_seed(0)))
     state = fit.init(start, 0)
     before = fit.misfit_of(state, problem, settings)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Truncation
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
@@ -40,7 +41,7 @@ def _gradient(settings: FitSettings) -> tuple[fit.FitState, NDArray[np.float64]]
     """(state, the gradient on means [n, 3] that a step of the fit takes): Adam's first moments are a tenth of it."""
     start = _blobs()
     data = project(start, VIEWS).numpy()
-    problem = fit.problem_of(data, VIEWS, GRID, start.density_unit, settings)
+    problem = fit.problem_of(Views(data, VIEWS), GRID, start.density_unit, settings)
     state = fit.init(start, 0)
     before = {name: values.copy() for name, values in state.parameters.items()}
     fit.step(state, problem, settings, 0.0, view=0)

@@ -16,13 +16,13 @@ import click
 
 from beamline.cli.options import json_option
 from beamline.cli.terminal import answering
-from beamline.core.durations import seconds_left
+from beamline.core.durations import in_turn
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.event_lines import event_of
-from beamline.core.events import Done, Failed, Sink, StateEntered, TrialReached, Warned
-from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_whole
+from beamline.core.events import Done, Failed, Sink, StateEntered, Warned
+from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_table
 from beamline.core.process import ProcessEnd, json_object, run_to_end
-from beamline.core.text import SENTENCE, count, csv_text, one_line, printable, safe_name
+from beamline.core.text import SENTENCE, count, one_line, printable, safe_name
 from beamline.storage.writer_lock import WriterLock
 from drivers.base.clock import Clock
 
@@ -90,11 +90,8 @@ def run_batch(scans: Sequence[Path], recipe: Path | None, folder: Path, sink: Si
     try:
         rows = _rows(scans, _read(folder))
         _write(folder, rows)
-        start, waiting = clock.now(), [n for n, row in enumerate(rows) if not row.has_volume]
-        for tried, n in enumerate(waiting):
-            spent = clock.now() - start
-            eta, rate = seconds_left(tried, len(waiting), spent), 60 * tried / max(spent, 1e-9)
-            sink(TrialReached("batch", tried, len(waiting), rows[n].scan, eta, rate, time=clock.now()))
+        waiting = [n for n, row in enumerate(rows) if not row.has_volume]
+        for n in in_turn("batch", waiting, lambda n: rows[n].scan, sink, clock):
             row = rows[n] = _one(rows[n], folder / rows[n].name, how, sink, clock)
             _write(folder, rows)
             state = row.state + (f" with {count(row.warnings, 'warning')}" if row.warnings else "")
@@ -247,9 +244,7 @@ def _refuse_names(rows: Sequence[BatchRow]) -> None:
 
 
 def _write(folder: Path, rows: Sequence[BatchRow]) -> None:
-    names = [column.name for column in fields(BatchRow)]
-    table = csv_text([names, *(vars(row).values() for row in rows)])
-    write_whole(folder / TABLE, table.encode("utf-8", "surrogateescape"), replace=True)
+    write_table(folder / TABLE, [vars(row) for row in rows], [column.name for column in fields(BatchRow)])
 
 
 def scans_of(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> list[Path]:

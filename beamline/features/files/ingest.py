@@ -22,6 +22,7 @@ from beamline.storage import hdf5
 from beamline.storage.flag_legend import UNMARKED
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import altered_sentence, parts_joined, stated_used
 from beamline.storage.writer_lock import QUIET, held
 from beamline.storage.writers import layout
@@ -89,7 +90,8 @@ def ingest(
         definition = layout.NXTOMO if source.dtype.kind in "iu" else layout.FLOAT_DEFINITION
         frames = len(source.table)
         size = frames * source.shape[0] * source.shape[1] * source.dtype.itemsize
-        findings = (*parts_joined(source), *(each for each in stated_used(source) if each.severity != "info"))
+        stated = ScanEvidence(source)
+        findings = (*parts_joined(stated), *(each for each in stated_used(stated) if each.severity != "info"))
         return Ingested(out, definition, frames, size, invalid, tuple(finding.message for finding in findings))
 
 

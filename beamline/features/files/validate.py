@@ -23,12 +23,10 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.transforms import WRAPPED, brief_source
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.rules import Finding
-from beamline.storage.rules.light import darks_beside_views
+from beamline.storage.rules.evidence import VIEWS, ScanEvidence
 from beamline.storage.rules.pixels import CONSTANT_DARKS
-from beamline.storage.rules.references import VIEWS, ViewLight, reference_groups, references_usable
-from beamline.storage.rules.scan import SOURCE_RULES, altered_sentence, central_ray_taken, scan_ended
+from beamline.storage.rules.scan import altered_sentence, findings_of
 from beamline.storage.rules.stored_order import SINOGRAM
-from beamline.storage.rules.treatment import frames_flagged
 from beamline.storage.volumes.files import opened_volume, times_of, volume_format
 from beamline.storage.writer_lock import abandoned, held
 from beamline.storage.writers.recon_file import opened_reconstruction
@@ -87,8 +85,9 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
                     of_all |= dict.fromkeys(volume_findings(record))
             return [*of_all]
         with open_scan(scan) as source:
-            findings += [*time_order(source), *framestamp_order(source), *source_findings(source)]
-            findings += views_lit(source, deep is not None)
+            evidence = ScanEvidence(source)
+            findings += [*time_order(source), *framestamp_order(source), *source_findings(evidence)]
+            findings += views_lit(evidence, deep is not None)
             findings += frames_as_written(source, deep)
     except DataError as error:
         findings.append(Finding("error", "readable", str(error)))
@@ -100,30 +99,20 @@ def validate(scan: SourceOptions | Path | str, deep: Progress | None = None) -> 
     return sorted(findings, key=lambda finding: order.index(finding.severity))
 
 
-def source_findings(source: ScanSource) -> list[Finding]:
+def source_findings(scan: ScanEvidence) -> list[Finding]:
     """Findings in an open scan: its content, its references, and its flagged frames. Numbers that wrapped explain all
     that light and references show."""
-    findings = list[Finding]()
-    for rule in (*SOURCE_RULES, central_ray_taken, scan_ended, references_usable, darks_beside_views, frames_flagged):
-        try:
-            findings += rule(source)
-        except TakesTooLongError as error:
-            findings.append(Finding("warning", "brief", str(error)))
+    findings = findings_of(scan)
     if any(finding.rule == WRAPPED and finding.severity == "error" for finding in findings):
         findings = [finding for finding in findings if finding.rule not in ("light", "bad-references")]
     return [*dict.fromkeys(findings)]
 
 
-def views_lit(source: ScanSource, every: bool) -> Iterator[Finding]:
+def views_lit(scan: ScanEvidence, every: bool) -> Iterator[Finding]:
     """Views have light throughout the scan. `beamline recon` names and leaves out dark views."""
-    counted = source.quantity == "counts"
-    views = source.table.views
-    kinds = {FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION}
-    if not counted or not source.table.has(*kinds):
-        return
+    views = scan.table.views
     looked_at = views if every else spread(views, VIEWS)
-    light = ViewLight.of(source, reference_groups(source))
-    unlit = [row for row in looked_at.tolist() if light.unlit(row)]
+    unlit = [] if scan.beam is None else [row for row in looked_at.tolist() if scan.unlit(row)]
     if unlit:
         of = f"{views.size} views" if every else f"{looked_at.size} views looked at"
         more = "" if every else " `validate --deep` looks at all."
@@ -218,7 +207,7 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     kinds = {kind.name.lower(): source.table.of_kind(kind).size for kind in FrameKind}
     until = clock() + LOOK
     brief = brief_source(source, lambda: clock() > until)
-    findings = source_findings(brief)
+    findings = source_findings(ScanEvidence(brief))
     attributes = dict(source.attributes)
     if not source.finished:
         dead = not held(source.path) if "status" in attributes else abandoned(source.path)  # our writer has a lock

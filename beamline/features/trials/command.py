@@ -27,15 +27,17 @@ from beamline.cli.options import (
 )
 from beamline.cli.recipe import DATA, METHOD, OUTPUT, Grouped, heading, names_given, typed_line
 from beamline.cli.selection_options import chosen, selection_options
-from beamline.cli.terminal import answering
-from beamline.core.errors import ScanStopped
 from beamline.core.text import safe_name
+from beamline.features.trials.sweep_command import sweep
 from beamline.features.trials.view_choices import STUDIES
 from recon.base.choices import Filter
 from recon.methods import BASELINE, DEFAULT, names_compared, names_of_one_volume
 
 if TYPE_CHECKING:
-    from beamline.features.trials.runner import ComparedScan, Plan
+    from beamline.features.trials.runner import ComparedScan
+
+
+__all__ = ["study", "sweep", "tradeoff"]
 
 
 def listed(value: str) -> tuple[str, ...]:
@@ -101,39 +103,27 @@ def tradeoff(request: TradeoffRequest) -> None:
     Writes a folder with tradeoff.csv, pictures and an HTML page.
     Ctrl-C keeps the trials that are done (exit code 4); before the first one it writes nothing (130).
     """
+    from beamline.features.trials.runner import compare
     from beamline.features.trials.tradeoff import planned_tradeoff
 
-    scan = _compared(request, request.methods or (), f"{safe_name(request.file.stem)}_tradeoff")
+    scan = _compared(request, request.methods or ())
+    folder = request.output or Path(f"{safe_name(request.file.stem)}_tradeoff")
     plan = partial(planned_tradeoff, scan, depth="quick" if request.quick else "full")
-    _compare(scan, plan, as_json=request.as_json)
+    compare(plan, request.file, folder, as_json=request.as_json)
 
 
-def _compared(request: TradeoffRequest | StudyRequest, methods: tuple[str, ...], folder: str) -> ComparedScan:
-    """The scan of a command, after its options were checked; `folder` is the usual one of its result."""
+def _compared(request: TradeoffRequest | StudyRequest, methods: tuple[str, ...]) -> ComparedScan:
+    """The scan of a command, after its options were checked."""
     from beamline.features.trials.runner import ComparedScan
 
     context, values = click.get_current_context(), request.values
     refuse_contradictions(context.command, names_given(context))
     source, selection = chosen(request.file, request.seed, values)
-    output = request.output or Path(folder)
     return ComparedScan(
-        source, selection, output, methods, request.truth,
+        source, selection, methods, request.truth,
         request.seconds, request.seed,
         typed_line(context),
     )  # fmt: skip
-
-
-def _compare(scan: ComparedScan, plan: Plan, *, as_json: bool) -> None:
-    """Run a comparison and print its table."""
-    from beamline.features.trials.runner import run_comparison
-    from beamline.features.trials.table import page_of, text
-
-    with answering(as_json) as answer:
-        table = run_comparison(plan, scan, answer.sink, answer.clock)
-        answer.lines = text(table), f"\n{'report':<10}{scan.folder / page_of(table)}"
-    if table.stopped:
-        counts = f"{len(table.compared)} of {len(table.todo)} trials"
-        raise ScanStopped(f"The {table.name} was stopped after {counts}; their results are in {scan.folder}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,11 +187,13 @@ def study(request: StudyRequest) -> None:
     the scan has is left out. Writes a folder with study.csv, pictures and report.html. Ctrl-C stops with
     the rows done so far (exit code 4; 130 and no folder if there are none).
     """
+    from beamline.features.trials.runner import compare
     from beamline.features.trials.tradeoff import planned_study
 
     methods, command = tuple(dict.fromkeys(request.methods)), click.get_current_context().command
     settings = row_settings(command, methods, dict(request.values))
-    scan = _compared(request, methods, f"{safe_name(request.file.stem)}_{request.which}")
+    scan = _compared(request, methods)
+    folder = request.output or Path(f"{safe_name(request.file.stem)}_{request.which}")
     asked = STUDIES[request.which]
     plan = partial(planned_study, scan, asked, settings=settings, ramp=request.ramp, draws=request.draws)
-    _compare(scan, plan, as_json=request.as_json)
+    compare(plan, request.file, folder, as_json=request.as_json)

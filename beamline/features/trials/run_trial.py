@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,24 +15,55 @@ from scipy.special import logsumexp
 
 from beamline.core.errors import user_message
 from beamline.core.machine import peak_memory, reset_peak_memory
-from beamline.features.trials.trial import MethodTrial, Outcome
+from beamline.features.trials.trial import MethodTrial, Outcome, TrialTable
 from beamline.features.trials.view_choices import ViewChoice
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.run import run_on
 from recon.assess import metrics
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import RunControl
+from recon.base.method import Method, RunControl
 from recon.base.views import parse_views
 from recon.base.volume import Grid, Volume
-from recon.judgement import judge
+from recon.judgement import contrast_in, judge
 from recon.warm_up import warm_up
 
 _JUDGED = "psnr", "ssim3d", "residual_held_out"
+_UNWATCHED = RunControl()
+
+
+class TrialRun(NamedTuple):
+    """What a trial runs: a method on views, for a volume on this grid."""
+
+    method: Method
+    prepared: PreparedProjections
+    grid: Grid
+    seed: int
+    device: str = "cpu"
+
+
+class TrialScan(Protocol):
+    """The scan of some trials: what each runs, and what its volume is worth.
+
+    Attributes:
+        truth: the volume [z, y, x] of all trials, if it is known.
+    """
+
+    truth: F32 | None = None
+
+    def asked_by(self, trial: MethodTrial) -> TrialRun:
+        """What a trial runs. Raises ValueError for a setting, or views, that there are not."""
+
+    def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
+        """Figures of a volume by name, and the squared residual of each view held out."""
+
+    def concluded(self, table: TrialTable) -> TrialTable:
+        """The table with what follows from all of its trials."""
+        return table
 
 
 @dataclass(frozen=True, eq=False)
-class TrialData:
+class TrialData(TrialScan):
     """What every trial of a scan shares.
 
     Attributes:
@@ -39,18 +71,41 @@ class TrialData:
             monitor says of views: trials are compared by all rays with the same weight.
         truth: the volume [z, y, x] on Grid.matching(geometry).
         references: volumes on the same grid that trials are compared with, in addition to the truth, by method.
-        regions: int8 [z, y, x], mask of dense and empty regions, see `metrics.kmeans_mask`; None without contrast.
+        regions: int8 [z, y, x], dense and empty regions, see `recon.judgement.regions_of`; None: there are none.
+        seed: of all trials.
     """
 
     prepared: PreparedProjections
-    truth: F32 | None
+    truth: F32 | None = None
     references: Mapping[str, F32] = field(default_factory=dict)
     regions: NDArray[np.int8] | None = None
+    seed: int = 0
 
     @property
     def geometry(self) -> Geometry:
         """Geometry of the views that may be used."""
         return self.prepared.geometry
+
+    def asked_by(self, trial: MethodTrial) -> TrialRun:
+        """The method of a trial, and its views."""
+        if trial.choice is None:
+            angles, period = self.geometry.angles, self.geometry.period
+            views = self.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
+        else:
+            views = averaged(self.prepared, trial.choice)
+        return TrialRun(trial.build(), views, Grid.matching(self.geometry), self.seed)
+
+    def measured(self, trial: MethodTrial, made: Volume) -> tuple[dict[str, float], list[float]]:
+        """Figures of a volume, and the squared residual of each view held out."""
+        truth = None if self.truth is None else Volume(self.truth, made.grid)
+        judged = judge(made, self.prepared.views, truth, held_out=self.prepared.views_held_out)
+        figures = {name: value for name, value in judged.figures.items() if name in _JUDGED}
+        if (reference := self.references.get(trial.method)) is not None:
+            figures["psnr_all"] = metrics.psnr(reference, made.data)
+            figures["ssim_all"] = metrics.ssim3d(reference, made.data)
+        if self.regions is not None:
+            figures |= contrast_in(self.regions, made)
+        return figures, [] if judged.held_out is None else judged.held_out.left.tolist()
 
 
 def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProjections:
@@ -75,24 +130,23 @@ def averaged(prepared: PreparedProjections, choice: ViewChoice) -> PreparedProje
 
 def run_trial(
     trial: MethodTrial,
-    data: TrialData,
-    seed: int,
-    now: Callable[[], float] = time.perf_counter,
+    data: TrialScan,
+    control: RunControl = _UNWATCHED,
     cpu: Callable[[], float] = time.process_time,
 ) -> tuple[Outcome, F32 | None]:
     """Make a trial's reconstruction and measure it: the outcome, and the volume [z, y, x]; None where it failed."""
-    control, grid = RunControl(now=now), Grid.matching(data.geometry)
     try:
-        method, prepared = trial.build(), _views_of(trial, data)
-        warm_up(method, data.geometry)  # so that compilation is in no trial's time
+        method, prepared, grid, seed, device = data.asked_by(trial)
+        trial = replace(trial, views=prepared.geometry.n_views)
+        warm_up(method, prepared.geometry, device=device)  # so that compilation is in no trial's time
         reset_peak_memory()
         before = cpu()
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always", UserWarning)
-            in_time = control if trial.seconds_asked is None else control.by(now() + trial.seconds_asked)
-            result = run_on(method, prepared, grid, seed, in_time)
+            in_time = control if trial.seconds_asked is None else control.by(control.now() + trial.seconds_asked)
+            result = run_on(method, prepared, grid, seed, in_time, device)
         cpu_seconds, peak = cpu() - before, peak_memory()  # before measuring, which has needs of its own
-        figures, squared = measured(trial.method, result.volume.data, data, grid)
+        figures, squared = data.measured(trial, result.volume)
     except (ValueError, MemoryError) as error:
         message = str(error) if isinstance(error, ValueError) else user_message(error)
         return Outcome(trial, "failed", message=message), None
@@ -107,23 +161,3 @@ def run_trial(
         cpu_seconds,
         squared,
     ), result.volume.data
-
-
-def _views_of(trial: MethodTrial, data: TrialData) -> PreparedProjections:
-    if trial.choice is None:
-        angles, period = data.geometry.angles, data.geometry.period
-        return data.prepared.of_views(parse_views(f"fixed:{trial.views}", angles, period=period))
-    return averaged(data.prepared, trial.choice)
-
-
-def measured(method: str, volume: F32, data: TrialData, grid: Grid) -> tuple[dict[str, float], list[float]]:
-    """Figures of the volume [z, y, x], and the squared residual of each view held out."""
-    made, truth = Volume(volume, grid), None if data.truth is None else Volume(data.truth, grid)
-    judged = judge(made, data.prepared.views, truth, held_out=data.prepared.views_held_out)
-    figures = {name: value for name, value in judged.figures.items() if name in _JUDGED}
-    if (reference := data.references.get(method)) is not None:
-        figures["psnr_all"] = metrics.psnr(reference, volume)
-        figures["ssim_all"] = metrics.ssim3d(reference, volume)
-    if data.regions is not None:
-        figures["snr"], figures["cnr"] = metrics.snr_cnr(metrics.sampled(volume), data.regions)
-    return figures, [] if judged.held_out is None else judged.held_out.left.tolist()

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from beamline.core.durations import seconds_left
-from beamline.core.errors import DataError
-from beamline.core.events import Done, Sink, TrialReached
-from beamline.core.files import refuse_existing, refuse_not_utf8
+from beamline.cli.terminal import answering
+from beamline.core.durations import in_turn
+from beamline.core.errors import DataError, ScanStopped
+from beamline.core.events import Done, Sink
+from beamline.core.files import refuse_existing, refuse_not_utf8, write_table
 from beamline.core.machine import machine
 from beamline.core.recon_events import TrialDone, TrialsStarted
-from beamline.core.sinks import Warn, Warnings
-from beamline.features.trials.run_trial import TrialData, run_trial
-from beamline.features.trials.table import write_page, write_table
+from beamline.core.sinks import Warnings
+from beamline.features.trials.run_trial import TrialData, TrialScan, run_trial
+from beamline.features.trials.table import text, write_page
 from beamline.features.trials.trial import HELD_OUT, MethodTrial, Outcome, TrialTable
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.prepared import hold_out
@@ -26,11 +27,10 @@ from beamline.reconstruct.truth import fit_truth, read_truth
 from beamline.report.sheets import SliceSheet
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import Clock
-from recon.assess import metrics
 from recon.base.arrays import F32
 from recon.base.empirical import ONE_IN
-from recon.base.volume import Grid
-from recon.methods import by_name
+from recon.base.volume import Grid, Volume
+from recon.judgement import regions_of
 
 _HELD_OUT_VIEWS = 16  # at most
 
@@ -40,7 +40,6 @@ class ComparedScan:
     """The scan of a trade-off or a study, and what holds for all of its reconstructions.
 
     Attributes:
-        folder: for the results; must not exist.
         methods: names in `recon.methods`; none: those that suit the comparison.
         truth: FILE or FILE:first:end to compare with.
         seconds: of each reconstruction, the same for all methods; None: they end when their work is done.
@@ -49,7 +48,6 @@ class ComparedScan:
 
     source: SourceOptions
     selection: Selection
-    folder: Path
     methods: Sequence[str] = ()
     truth: str | None = None
     seconds: float | None = None
@@ -57,27 +55,31 @@ class ComparedScan:
     command: str = ""
 
 
+Run = Callable[[TrialScan, MethodTrial], tuple[Outcome, F32 | None]]
+"""Runs a trial of a scan: its outcome and the volume [z, y, x]; None where it failed."""
+
+
 @dataclass(frozen=True, eq=False)
 class Planned:
     """What a comparison will do.
 
     Attributes:
+        data: gives the scan, once it has run what trials are compared with.
         table: before any trial is done.
-        references: trials whose volumes others are compared with, in addition to the truth: each with those of its
-            method. Without a truth the first one has the dense and the empty regions.
+        slices: those that are shown, before any is.
     """
 
-    data: TrialData
+    data: Callable[[Run], TrialScan]
     table: TrialTable
-    references: tuple[MethodTrial, ...] = ()
+    slices: SliceSheet = field(default_factory=SliceSheet)
 
 
-Plan = Callable[[Warn], Planned]
+Plan = Callable[[Sink, Clock], Planned]
 """Reads and corrects the views of a scan, and says which trials to run. ConfigError, DataError: nothing was written."""
 
 
 def opened_scan(
-    asked: ComparedScan, name: str, title: str, warn: Warn, *, held_out: bool
+    asked: ComparedScan, name: str, title: str, sink: Sink, clock: Clock, *, held_out: bool
 ) -> tuple[TrialData, TrialTable]:
     """Read and correct the views, after all inputs were checked; the table has no trials yet.
 
@@ -88,12 +90,10 @@ def opened_scan(
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    refuse_not_utf8(asked.source.path)
-    refuse_existing(asked.folder)
     truth_given = None if asked.truth is None else read_truth(asked.truth)
     with asked.source.open() as source:
         facts = dict(facts_of(source).table)
-        prepared = prepare_projections(source, asked.selection, warn).without_warnings
+        prepared = prepare_projections(source, asked.selection, Warnings(sink, clock)).without_warnings
     if held_out and truth_given is None:
         prepared = hold_out(prepared, ONE_IN, most=_HELD_OUT_VIEWS, advice="give --truth")
     truth = None
@@ -102,44 +102,43 @@ def opened_scan(
     by = HELD_OUT if truth is None else "psnr"
     facts["volume"] = " × ".join(map(str, Grid.matching(prepared.geometry).shape))
     table = TrialTable(name, title, (), by, machine(), facts, asked.command)
-    return TrialData(prepared, truth), table
+    return TrialData(prepared, truth, seed=asked.seed), table
 
 
-def _run_and_show(slices: SliceSheet, seed: int, data: TrialData, trial: MethodTrial) -> tuple[Outcome, F32 | None]:
-    """The outcome and the volume [z, y, x] of a trial; None where it failed. The page shows baselines and rows."""
-    outcome, volume = run_trial(trial, data, seed)
-    if volume is not None and trial.choice is not None:
-        slices.add(trial.label, volume, trial.choice.family, trial.method)
-    elif volume is not None and trial.group == "method":
-        slices.add(by_name(trial.method).label, volume)
+def _run_and_show(slices: SliceSheet, data: TrialScan, trial: MethodTrial) -> tuple[Outcome, F32 | None]:
+    """The outcome and the volume [z, y, x] of a trial; None where it failed."""
+    outcome, volume = run_trial(trial, data)
+    if volume is not None and trial.shown:
+        slices.add(trial.shown, volume, "" if trial.choice is None else trial.choice.family, trial.method)
     return outcome, volume
 
 
 def _run_all(
-    table: TrialTable, run: Callable[[MethodTrial], tuple[Outcome, F32 | None]], folder: Path, sink: Sink, clock: Clock
+    table: TrialTable, run: Callable[[MethodTrial], tuple[Outcome, F32 | None]], path: Path, sink: Sink, clock: Clock
 ) -> TrialTable:
-    """Run the trials in turn, and write the table after each; after Ctrl-C it is `stopped`.
+    """Run the trials in turn, and write the table to a CSV file after each; after Ctrl-C it is `stopped`.
+
+    Args:
+        run: the outcome and the volume [z, y, x] of a trial; None where it failed.
 
     Raises:
         KeyboardInterrupt: before any trial was done; nothing was written.
     """
-    begin, todo = clock.now(), table.todo
+    trials, todo = [outcome.trial for outcome in table.outcomes], table.todo
     try:
-        for n, index in enumerate(todo):
-            trial, whole, spent = table.outcomes[index].trial, table, clock.now() - begin
-            eta, rate = seconds_left(n, len(todo), spent), 60 * n / max(spent, 1e-9)
-            sink(TrialReached(table.name, n, len(todo), trial.label, eta, rate, time=clock.now()))
+        for n, index in enumerate(in_turn(table.name, todo, lambda at: trials[at].label, sink, clock), 1):
+            trial, whole = trials[index], table
             table = whole.with_outcome(index, Outcome(trial, "interrupted", message="ended before it was done"))
             outcome, _ = run(trial)
             table = whole.with_outcome(index, outcome)
             if table.compared:
-                write_table(folder, table)
-            sink(replace(_event_of(table, n + 1, len(todo), outcome), time=clock.now()))
+                write_table(path, table.records)
+            sink(replace(_event_of(table, n, len(todo), outcome), time=clock.now()))
     except KeyboardInterrupt:
         if not table.compared:
             raise
         table = replace(table, stopped=True)
-    write_table(folder, table)
+    write_table(path, table.records)
     return table
 
 
@@ -159,7 +158,22 @@ def _event_of(table: TrialTable, n: int, of: int, outcome: Outcome) -> TrialDone
     )
 
 
-def run_comparison(plan: Plan, scan: ComparedScan, sink: Sink, clock: Clock) -> TrialTable:
+def compare(plan: Plan, file: Path | str, folder: Path, *, as_json: bool) -> TrialTable:
+    """Run a comparison, and print its table.
+
+    Raises:
+        ScanStopped: it was stopped after some trials.
+    """
+    with answering(as_json) as answer:
+        table = run_comparison(plan, file, folder, answer.sink, answer.clock)
+        answer.lines = text(table), f"\n{'report':<10}{folder / table.page}"
+    if table.stopped:
+        counts = f"{len(table.compared)} of {len(table.todo)} trials"
+        raise ScanStopped(f"The {table.name} was stopped after {counts}; their results are in {folder}.")
+    return table
+
+
+def run_comparison(plan: Plan, file: Path | str, folder: Path, sink: Sink, clock: Clock) -> TrialTable:
     """Run all trials and write table, pictures and page into the folder. The event `done` names the folder.
 
     The table is written after every trial, so that an interruption loses at most one. After Ctrl-C the table is
@@ -167,51 +181,50 @@ def run_comparison(plan: Plan, scan: ComparedScan, sink: Sink, clock: Clock) -> 
 
     Args:
         plan: reads the scan and says which trials to run.
+        file: of the scan, for the event.
+        folder: must not exist.
 
     Raises:
         ConfigError, DataError: nothing was written, or the table of the trials that were done.
         KeyboardInterrupt: before the first trial was done; nothing was written.
     """
-    started, slices = clock.now(), SliceSheet()
-    planned, run = plan(Warnings(sink, clock)), partial(_run_and_show, slices, scan.seed)
-    table, todo = planned.table, len(planned.table.todo)
-    left_out = len(table.outcomes) - todo
-    sink(TrialsStarted(scan.source.path, table.name, todo, left_out, table.by, time=clock.now()))
-    scan.folder.mkdir()
+    refuse_not_utf8(file)
+    refuse_existing(folder)
+    began = clock.now()
+    planned = plan(sink, clock)
+    table, path, run = planned.table, folder / f"{planned.table.name}.csv", partial(_run_and_show, planned.slices)
+    todo = len(table.todo)
+    sink(TrialsStarted(file, table.name, todo, len(table.outcomes) - todo, table.by, time=clock.now()))
+    folder.mkdir()
     try:
-        data = _with_references(planned.data, planned.references, partial(run, planned.data), scan.seed)
+        data = planned.data(run)
         if data.truth is not None:
-            slices.add("truth", data.truth)
-        table = _run_all(table, partial(run, data), scan.folder, sink, clock)
+            planned.slices.add("truth", data.truth)
+        table = data.concluded(_run_all(table, partial(run, data), path, sink, clock))
     finally:
         with suppress(OSError):  # it has results; without any the next run would refuse it
-            scan.folder.rmdir()
-    write_page(scan.folder, table, slices)
-    summary = {"output": scan.folder, "trials": todo, "done": len(table.compared), "stopped": table.stopped}
-    sink(Done({**summary, "seconds": clock.now() - started}, time=clock.now()))
+            folder.rmdir()
+    write_table(path, table.records)
+    write_page(folder, table, planned.slices)
+    summary = {"output": folder, "trials": todo, "done": len(table.compared), "stopped": table.stopped}
+    found = {"best": table.best, "scores": [outcome.metrics.get(table.by) for outcome in table.compared]}
+    sink(Done({**summary, **found, "seconds": clock.now() - began}, time=clock.now()))
     return table
 
 
-def _with_references(
-    data: TrialData,
-    references: Sequence[MethodTrial],
-    run: Callable[[MethodTrial], tuple[Outcome, F32 | None]],
-    seed: int,
-) -> TrialData:
-    """The data with the volumes of these trials, and the dense and empty regions of the truth or of the first one.
+def with_references(data: TrialData, references: Sequence[MethodTrial], run: Run) -> TrialData:
+    """The data with volumes that others are compared with, in addition to the truth, each with those of its method; and
+    with the dense and empty regions of the truth, or of the first one.
 
     Raises:
         DataError: a reference could not be made.
     """
-    if not references:
-        return data
-    volumes, regions = dict[str, F32](), None
+    volumes = dict[str, F32]()
     for reference in references:
-        outcome, volume = run(reference)
+        outcome, volume = run(data, reference)
         if volume is None:
             raise DataError(f"{reference.label}, to compare with, failed: {outcome.message}. Nothing was written.")
         volumes[reference.method] = volume
     contrast = next(iter(volumes.values())) if data.truth is None else data.truth
-    with suppress(ValueError):  # it has no dense and empty regions
-        regions = metrics.kmeans_mask(metrics.sampled(contrast), seed)
+    regions = regions_of(Volume(contrast, Grid.matching(data.geometry)), data.seed)
     return replace(data, references=volumes, regions=regions)

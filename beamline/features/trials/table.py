@@ -1,4 +1,4 @@
-"""A table of trials as text, CSV, pictures and a page, and what follows from it in sentences."""
+"""A table of trials as text, pictures and a page, and what follows from it in sentences."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from textwrap import fill
 
 import numpy as np
 
-from beamline.core.files import REPORT, write_whole
+from beamline.core.files import write_whole
 from beamline.core.machine import machine_line
-from beamline.core.text import csv_text
 from beamline.features.trials.trial import HELD_OUT, LEAST_GAIN, Outcome, TrialTable
 from beamline.report.figures import WIDTH, new_figure, png
 from beamline.report.html import Picture, render
@@ -20,56 +19,54 @@ from beamline.report.metrics import METRICS
 from beamline.report.sheets import SliceSheet
 from recon.methods import by_name
 
-FIGURES = {
-    "psnr": ("PSNR", "dB against the truth"),
-    "ssim3d": ("SSIM", "mean over the slices of three directions, against the truth"),
-    "psnr_all": ("PSNR all", "dB against the volume of all views by the same method"),
-    "ssim_all": ("SSIM all", "against the same volume"),
-    "snr": ("SNR rims", "dB, of the whole dense and empty region, with their rims"),
-    "cnr": ("CNR rims", "dB, of the same regions"),
-    HELD_OUT: ("held out", METRICS[HELD_OUT].label),
-}
-"""Heading of each metric of a trial, and what it is."""
-_DIGITS_OF = {"psnr_all": "psnr", "ssim_all": "ssim3d"}
 _QUALITY = {
     "psnr": "PSNR (dB)",
     "psnr_all": "PSNR all views (dB)",
     HELD_OUT: "−20 log₁₀ of the held-out residual (dB)",
 }
+"""Label of the quality by each metric."""
 _COSTS: dict[str, Callable[[Outcome], float]] = {
     "time (s)": lambda outcome: outcome.seconds,
     "memory (MB)": lambda outcome: math.nan if outcome.peak_bytes is None else outcome.peak_bytes / 1e6,
     "dose (frames)": lambda outcome: outcome.trial.frames,  # those that several views share are counted once
 }  # that a picture shows, by the label of their axis
-_NEAR = 1.0  # dB below the best figure: a tenth more error
 _SHOWN_DB = 12.0  # below the best; worse trials are drawn at the lower edge
+_COLOURS = {"best": "tab:red", "alike": "tab:orange"}  # of frames, by verdict
+_MARKS = {"front": "*", "best": "*", "alike": "~"}
+_LEGENDS = {
+    "front": "*: on the front of time and quality.",
+    "best": "*: the least residual.",
+    "alike": "~: no more than that, but for chance.",
+}
+_NEAR = 1.0  # dB below the best figure: a tenth more error
 _WIDTH = 120  # characters
-
-
-def page_of(table: TrialTable) -> str:
-    """File name of the page."""
-    return "tradeoff.html" if table.name == "tradeoff" else REPORT
 
 
 def columns(table: TrialTable) -> list[str]:
     """Headings of the table."""
-    return ["s", "CPU s", "MB", *(words for name, (words, _) in FIGURES.items() if name in table.metrics)]
+    return ["s", "CPU s", "MB", *(METRICS[name].short for name in figures_of(table))]
+
+
+def figures_of(table: TrialTable) -> list[str]:
+    """Names of the figures that any row has, in their usual order."""
+    return [name for name in METRICS if name in table.metrics]
 
 
 def cells(table: TrialTable, outcome: Outcome) -> list[str]:
     """The values of a row under `columns`, as text."""
     memory = "–" if outcome.peak_bytes is None else f"{outcome.peak_bytes / 1e6:.0f}"
-    shown = [name for name in FIGURES if name in table.metrics]
-    figures = [_figure(name, outcome.metrics[name]) if name in outcome.metrics else "–" for name in shown]
+    figures = [
+        _figure(name, outcome.metrics[name], 2 * table.asks_best) if name in outcome.metrics else "–"
+        for name in figures_of(table)
+    ]
     return [_seconds(outcome.seconds), _seconds(outcome.cpu_seconds), memory, *figures]
 
 
-def _figure(name: str, value: float) -> str:
-    """A figure with its digits; "equal" for the PSNR of two equal volumes."""
-    name = _DIGITS_OF.get(name, name)
+def _figure(name: str, value: float, finer: int = 0) -> str:
+    """A figure with its digits, and so many more; "equal" for the PSNR of two equal volumes."""
     if math.isfinite(value):
-        return f"{value:.{METRICS[name].digits}f}"
-    return "equal" if name == "psnr" and value > 0 else "undefined"
+        return f"{value:.{METRICS[name].digits + finer}f}"
+    return "equal" if name.startswith("psnr") and value > 0 else "undefined"
 
 
 def _seconds(seconds: float) -> str:
@@ -84,8 +81,8 @@ def _status(outcome: Outcome) -> str:
 
 
 def text(table: TrialTable) -> str:
-    """The table for people; * marks the rows on the front of time and quality."""
-    head, front = columns(table), _marked(table)
+    """The table for people; a mark before a row is its verdict."""
+    head, verdicts = columns(table), [table.verdict(outcome) for outcome in table.outcomes]
     width = max(len(outcome.trial.label) for outcome in table.outcomes)
     wide = [max(8, len(name) + 2) for name in head]
 
@@ -94,67 +91,56 @@ def text(table: TrialTable) -> str:
 
     lines = [table.question] if table.question else []
     lines += [machine_line(dict(table.machine)), "", row(" ", "trial", head)]
-    for outcome in table.outcomes:
+    for outcome, verdict in zip(table.outcomes, verdicts, strict=True):
         if outcome.status == "done":
-            lines.append(row("*" if outcome in front else " ", outcome.trial.label, cells(table, outcome)))
+            lines.append(row(_MARKS.get(verdict, " "), outcome.trial.label, cells(table, outcome)))
         else:
             lines.append(f"  {outcome.trial.label}  {_status(outcome)}")
-    legends = [f"{words}: {legend}" for name, (words, legend) in FIGURES.items() if name in table.metrics]
+    shown = [METRICS[name] for name in figures_of(table)]
+    legends = [f"{each.short}: {each.label}{', dB' if each.unit else ''}" for each in shown]
     notes = ["; ".join(legends) + "."] if legends else []
-    notes += ["*: on the front of time and quality."] if front else []
+    notes += [legend for verdict, legend in _LEGENDS.items() if verdict in verdicts]
     notes += [*sentences(table), *(f"{o.trial.label}: {o.message}." for o in table.compared if o.message)]
     return "\n".join([*lines, "", *(fill(line, _WIDTH, subsequent_indent="  ") for line in notes)])
 
 
-def write_table(folder: Path, table: TrialTable) -> None:
-    """Write NAME.csv, a line for each trial, in place of an earlier one; a value that is not known is empty."""
-    rows = [table.record(outcome) for outcome in table.outcomes]
-    content = csv_text([list(rows[0]), *(row.values() for row in rows)])
-    write_whole(folder / f"{table.name}.csv", content, replace=True)
-
-
 def write_page(folder: Path, table: TrialTable, slices: SliceSheet) -> None:
     """Write the pictures that have data, and the page."""
-    pictures = dict(_pictures(table, slices))
-    for name, picture in pictures.items():
+    drawn = dict(_pictures(table, slices))
+    for name, picture in drawn.items():
         write_whole(folder / name, picture.png, replace=True)
-    write_whole(folder / page_of(table), to_html(table, list(pictures.values())), replace=True)
+    write_whole(folder / table.page, to_html(table, list(drawn.values())), replace=True)
 
 
-def to_html(table: TrialTable, pictures: Sequence[Picture]) -> str:
+def to_html(table: TrialTable, drawn: Sequence[Picture]) -> str:
     """The table and its pictures as an HTML page."""
-    front = _marked(table)
+    verdicts = [table.verdict(outcome) for outcome in table.outcomes]
     counts = f"{len(table.compared)} of {len(table.outcomes)} trials on {machine_line(dict(table.machine))}."
     return render(
         "trials.html",
         title=table.title,
         summary=f"{table.question} {counts}".strip(),
         sentences=sentences(table),
-        pictures=pictures,
+        pictures=drawn,
         columns=columns(table),
         rows=[
             {
                 "label": outcome.trial.label,
-                "marked": outcome in front,
+                "marked": bool(verdict),
                 "cells": cells(table, outcome) if outcome.status == "done" else [],
                 "reason": _status(outcome),
             }
-            for outcome in table.outcomes
+            for outcome, verdict in zip(table.outcomes, verdicts, strict=True)
         ],
-        bold=bool(front),
+        bold=any(verdicts),
         scan=table.scan,
         command=table.command,
     )
 
 
-def _marked(table: TrialTable) -> list[Outcome]:
-    """The rows of a trade-off that are on the front."""
-    return table.front if table.name == "tradeoff" else []
-
-
 def sentences(table: TrialTable) -> list[str]:
     """What follows from the table, and what its figures mean."""
-    if table.name == "tradeoff":
+    if table.asks_costs:
         return _conclusions(table)
     return [*_draws(table), *table.notes]
 
@@ -188,10 +174,10 @@ def _draws(table: TrialTable) -> Iterator[str]:
             families.setdefault((outcome.trial.method, outcome.trial.choice.family), []).append(outcome)
     for (method, family), rows in families.items():
         parts = []
-        for name in [name for name in FIGURES if name in table.metrics]:
+        for name in figures_of(table):
             values = [row.metrics[name] for row in rows if name in row.metrics]
             mean, low, high = (_figure(name, float(of(values))) for of in (np.mean, min, max))
-            parts.append(f"{FIGURES[name][0]} {mean} ({low} to {high})")
+            parts.append(f"{METRICS[name].short} {mean} ({low} to {high})")
         yield f"{method}, {family}, mean of {len(rows)}: {', '.join(parts)}."
 
 
@@ -207,11 +193,24 @@ def _pictures(table: TrialTable, slices: SliceSheet) -> Iterator[tuple[str, Pict
         caption = (
             "The same slice by each method with its usual settings, all in the grey window of matter of the first."
         )
-        yield "slices.png", Picture("Slices", caption, slices.png(labels))
+        marks = dict[str, tuple[str, str]]()
+        if table.asks_best:
+            caption = (
+                "The middle slice of each trial in one grey window, with its residual; of large ones the part that "
+                "changes most. The best has a red frame, those that are no worse but for chance an orange one."
+            )
+            marks = {each.trial.shown: _mark(table, each) for each in table.compared}
+        yield "slices.png", Picture("Slices", caption, slices.png(labels, marks))
     for method in dict.fromkeys(outcome.trial.method for outcome in table.compared if outcome.trial.choice):
         caption = f"One slice of every volume by {method}, in one grey window; of repeated draws the first."
         title = f"{by_name(method).label}, slice by slice"
         yield f"slices_{method}.png", Picture(title, caption, slices.png(slices.labels(method)))
+
+
+def _mark(table: TrialTable, outcome: Outcome) -> tuple[str, str]:
+    """The residual of a trial, and the colour of its frame."""
+    score = outcome.metrics.get(table.by)
+    return "" if score is None else f"{score:.5g}", _COLOURS.get(outcome.verdict, "")
 
 
 def quality_plot(table: TrialTable) -> bytes:
@@ -231,8 +230,8 @@ def quality_plot(table: TrialTable) -> bytes:
             axes.set_xscale("log")
         axes.set_xlabel(label)
         axes.grid(alpha=0.3)
-    front = [(outcome.seconds, outcome.quality(table.by)) for outcome in _marked(table)]
-    if front:
+    front = [(outcome.seconds, outcome.quality(table.by)) for outcome in table.front]
+    if front and table.asks_costs:
         panels[0].step(*zip(*front, strict=True), where="post", color="black", lw=1.1, alpha=0.5)
     panels[0].set_ylim(bottom=max(min(outcome.quality(table.by) for outcome in shown), floor) - 0.5)
     panels[0].set_ylabel(_QUALITY[table.by])

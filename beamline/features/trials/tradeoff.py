@@ -7,14 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 from typing import Literal
 
 from beamline.core.errors import DataError
-from beamline.core.sinks import Warn
-from beamline.features.trials.runner import ComparedScan, Planned, opened_scan
+from beamline.core.events import Sink
+from beamline.core.sinks import Warnings
+from beamline.features.trials.runner import ComparedScan, Planned, opened_scan, with_references
 from beamline.features.trials.trial import MethodTrial, Outcome
 from beamline.features.trials.view_choices import Study, ViewChoice, ViewSet
+from drivers.base.clock import Clock
 from recon.base.choices import Filter
 from recon.base.method import Plain
 from recon.methods import BASELINE, METHODS, names_compared
@@ -25,7 +28,8 @@ REFERENCE = "all views"
 def planned_study(
     scan: ComparedScan,
     study: Study,
-    warn: Warn,
+    sink: Sink,
+    clock: Clock,
     settings: Mapping[str, Mapping[str, Plain]] | None = None,
     ramp: Filter = "hann",
     draws: int = 3,
@@ -41,7 +45,7 @@ def planned_study(
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    data, table = opened_scan(scan, "study", study.title, warn, held_out=False)
+    data, table = opened_scan(scan, "study", study.title, sink, clock, held_out=False)
     choices = study.rows(ViewSet(data.geometry.angles, data.geometry.period, scan.seed, draws))
     n_views, given = data.geometry.n_views, dict(settings or {})
     given[BASELINE] = {"filter": ramp, **given.get(BASELINE, {})}
@@ -64,20 +68,21 @@ def planned_study(
             f"{scan.source.path}: {n_views} views are too few for any row of {study.name}: "
             f"left out: {choices[-1].reason}. Take a scan with more views."
         )
+    warn = Warnings(sink, clock)
     for choice in choices:
         if choice.groups is None:
             warn(f"{choice.label} is left out: {choice.reason}")
     whole = ViewChoice(REFERENCE, [[view] for view in range(n_views)])
     references = tuple(trial(method, whole) for method in dict.fromkeys((BASELINE, *scan.methods)))
     data = replace(data, prepared=replace(data.prepared, held_out=None))
-    return Planned(data, table, references)
+    return Planned(partial(with_references, data, references), table)
 
 
 def _note(n_views: int) -> str:
     return (
         f"PSNR all and SSIM all are against the volume of {REFERENCE} ({n_views}) by the same method and settings: "
         "they say what fewer views lose, not which method is better. That volume has noise, too, which rows share as "
-        "far as they share its views. SNR and CNR are not those of beamline recon; a smoother volume has more."
+        "far as they share its views. A smoother volume has more SNR and CNR."
     )
 
 
@@ -92,13 +97,13 @@ Depth = Literal["quick", "full"]
 _SHARES: Mapping[Depth, tuple[float, ...]] = {"quick": (0.5,), "full": (0.25, 0.5)}
 
 
-def planned_tradeoff(scan: ComparedScan, warn: Warn, depth: Depth = "quick") -> Planned:
+def planned_tradeoff(scan: ComparedScan, sink: Sink, clock: Clock, depth: Depth = "quick") -> Planned:
     """Read and correct the views, hold some out where there is no truth, and plan the trials.
 
     Raises:
         ConfigError, DataError: nothing was written.
     """
-    data, table = opened_scan(scan, "tradeoff", "What accuracy costs", warn, held_out=True)
+    data, table = opened_scan(scan, "tradeoff", "What accuracy costs", sink, clock, held_out=True)
     geometry = data.geometry
     methods = scan.methods or names_compared()
     if scan.seconds is None:
@@ -109,8 +114,10 @@ def planned_tradeoff(scan: ComparedScan, warn: Warn, depth: Depth = "quick") -> 
         table,
         outcomes=tuple(Outcome(trial, "not run") for trial in trials),
         scan={**table.scan, "views used": str(geometry.n_views)},
+        asks_costs=True,
+        page="tradeoff.html",
     )
-    return Planned(data, table)
+    return Planned(lambda run: data, table)
 
 
 def trials_of(method: str, n_views: int, depth: Depth) -> list[MethodTrial]:

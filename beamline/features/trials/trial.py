@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from beamline.core.files import REPORT
 from beamline.features.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
 from recon.base.method_kinds import Direct
@@ -44,6 +45,13 @@ class MethodTrial:
     def left_out(self) -> bool:
         """The scan does not have the views that it asks for."""
         return self.choice is not None and self.choice.groups is None
+
+    @property
+    def shown(self) -> str:
+        """The label under which the page shows a slice: of all rows of a study, else of baselines alone."""
+        if self.choice is not None:
+            return self.label
+        return by_name(self.method).label if self.group == "method" else ""
 
     @property
     def frames(self) -> int:
@@ -94,6 +102,7 @@ class Outcome:
         gaussians: in the model at the end; None for voxel methods.
         cpu_seconds: of all threads of the reconstruction; the ones to compare on a machine that others use, too.
         squared_residuals: of each view held out.
+        verdict: "best"; "alike", not told from it by chance; empty: not compared so, or worse.
     """
 
     trial: MethodTrial
@@ -105,6 +114,7 @@ class Outcome:
     message: str = ""
     cpu_seconds: float = math.nan
     squared_residuals: Sequence[float] = ()
+    verdict: str = ""
 
     def quality(self, by: str) -> float:
         """dB, more is better, by the metric of this name; NaN where it is not known."""
@@ -119,7 +129,7 @@ class TrialTable:
     """All trials of a scan, with the scan and the machine that they ran on.
 
     Attributes:
-        name: of the command: tradeoff or study.
+        name: of the command, and of its CSV file.
         title: of the page.
         outcomes: in the order of the plan, also of trials that are left out.
         by: the metric of quality: psnr, psnr_all or residual_held_out.
@@ -127,6 +137,9 @@ class TrialTable:
         question: that the table answers; empty: none.
         stopped: it was interrupted before all trials were done.
         notes: sentences on what the figures mean.
+        asks_costs: which trial is worth its time: the front of time and quality is named.
+        asks_best: which trial leaves least of the views held out: figures have more digits, and are in the pictures.
+        page: file name of the page.
     """
 
     name: str
@@ -139,6 +152,9 @@ class TrialTable:
     question: str = ""
     stopped: bool = False
     notes: Sequence[str] = ()
+    asks_costs: bool = False
+    asks_best: bool = False
+    page: str = REPORT
 
     def with_outcome(self, index: int, outcome: Outcome) -> TrialTable:
         """The table with this outcome in place of the one of this number."""
@@ -148,6 +164,11 @@ class TrialTable:
     def compared(self) -> tuple[Outcome, ...]:
         """The trials that reconstructed the scan successfully."""
         return tuple(o for o in self.outcomes if o.status == "done")
+
+    @property
+    def best(self) -> dict[str, Plain] | None:
+        """The settings of the best trial; None: none is named."""
+        return next((dict(each.trial.settings) for each in self.compared if each.verdict == "best"), None)
 
     @property
     def todo(self) -> list[int]:
@@ -187,25 +208,34 @@ class TrialTable:
         error = apart.std(ddof=1) / math.sqrt(apart.size)
         return max(LEAST_GAIN, _ERRORS * 10 / math.log(10) * float(error / level)) if level > 0 else LEAST_GAIN
 
-    def record(self, outcome: Outcome) -> dict[str, Any]:
-        """A row of the CSV: all that is known of a trial, by name; None where it is known of another row only."""
-        trial = outcome.trial
-        every = [each.trial for each in self.outcomes]
-        values: dict[str, Any] = {
-            "row": trial.label if trial.choice is None else trial.choice.label,
-            **{name: getattr(trial, name) for name in ("group", "method", "views", "frames")},
-            "window": 1 if trial.choice is None else trial.choice.window,
-            **{name: trial.settings.get(name) for each in every for name in each.settings},
-            "status": outcome.status,
-            "seconds_asked": trial.seconds_asked,
-            **{name: getattr(outcome, name) for name in ("seconds", "cpu_seconds", "peak_bytes")},
-            "gaussians_end": outcome.gaussians,
-            **{name: outcome.metrics.get(name) for name in sorted(self.metrics)},
-            "quality_db": outcome.quality(self.by),
-            "message": outcome.message,
-        }
-        unknown = [name for name, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
-        return values | dict.fromkeys(unknown)
+    def verdict(self, outcome: Outcome) -> str:
+        """That of the outcome, or "front" where it is on the front of a table that asks for it."""
+        return "front" if self.asks_costs and outcome in self.front else outcome.verdict
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """The rows of the CSV: all that is known of each trial, by name; None where it is known of another row only."""
+        settings = [name for outcome in self.outcomes for name in outcome.trial.settings]
+        rows: list[dict[str, Any]] = []
+        for outcome in self.outcomes:
+            trial = outcome.trial
+            values: dict[str, Any] = {
+                "row": trial.label if trial.choice is None else trial.choice.label,
+                **{name: getattr(trial, name) for name in ("group", "method", "views", "frames")},
+                "window": 1 if trial.choice is None else trial.choice.window,
+                **{name: trial.settings.get(name) for name in settings},
+                "status": outcome.status,
+                "seconds_asked": trial.seconds_asked,
+                **{name: getattr(outcome, name) for name in ("seconds", "cpu_seconds", "peak_bytes")},
+                "gaussians_end": outcome.gaussians,
+                **{name: outcome.metrics.get(name) for name in sorted(self.metrics | {self.by})},
+                "quality_db": outcome.quality(self.by),
+                "verdict": self.verdict(outcome),
+                "message": outcome.message,
+            }
+            unknown = [name for name, each in values.items() if isinstance(each, float) and not math.isfinite(each)]
+            rows.append(values | dict.fromkeys(unknown))
+        return rows
 
 
 def _rounded(cost: float) -> float:

@@ -13,7 +13,7 @@ from beamline.core.text import count
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
 from beamline.projections.registry import geometry_steps
-from beamline.projections.selection import Selection, cone_of, pivot_of, pixel_size, rows_of, with_pivot
+from beamline.projections.selection import ScanSelection, Selection, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from beamline.projections.usable_views import UsableViews
     from beamline.storage.pose_table import PoseTable
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.arrays import F64, I64
     from recon.base.geometry import Geometry
 
@@ -66,13 +67,13 @@ class PosesOfFile:
 
     def place(
         self,
-        source: ScanSource,
-        selection: Selection,
+        scan: ScanEvidence,
+        selection: ScanSelection,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        return poses_of(source, selection, usable.frames) or Unmoved(usable.frames)
+        return poses_of(scan.source, selection, usable.frames) or Unmoved(usable.frames)
 
 
 def stated_poses(source: ScanSource, selection: Selection) -> PoseTable | None:
@@ -94,6 +95,7 @@ class ScanPoses:
     """Poses of the frames of a scan.
 
     Attributes:
+        table: the poses as the file states them.
         shifts: float64 [frame, 2], (col, row) in pixels of the unbinned detector, NaN where the file states none.
         roll, tilt: float64 [frame], radians.
         frames: int64 [view], the rows that are used.
@@ -104,6 +106,7 @@ class ScanPoses:
         view_of: int64 [frame], which of these views a frame is; -1: none.
     """
 
+    table: PoseTable
     shifts: F64
     roll: F64
     tilt: F64
@@ -142,7 +145,7 @@ class ScanPoses:
         return with_pivot(posed, self.pivot)
 
 
-def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses | None:
+def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanPoses | None:
     """The poses of `frames` from the selection's file, or else from the scan file; None if neither states any.
 
     Raises:
@@ -173,14 +176,14 @@ def poses_of(source: ScanSource, selection: Selection, frames: I64) -> ScanPoses
     n = len(source.table)
     every = np.full((n, 4), np.nan)
     every[rows >= 0] = np.column_stack((shifts, np.radians(table.turns_deg)))[rows[rows >= 0]]
-    pivot, sentence = pivot_of(source, selection), _sentence(table, shifts)
-    poses = ScanPoses(every[:, :2], every[:, 2], every[:, 3], frames, sentence, pivot, selection.binning)
+    pivot, sentence = selection.pivot, _sentence(table, shifts)
+    poses = ScanPoses(table, every[:, :2], every[:, 2], every[:, 3], frames, sentence, pivot, selection.binning)
     if table.vectors is None:
         return poses
     return replace(poses, vectors=_of_vectors(table, source, selection), view_of=rows)
 
 
-def _of_vectors(table: PoseTable, source: ScanSource, selection: Selection) -> Geometry:
+def _of_vectors(table: PoseTable, source: ScanSource, selection: ScanSelection) -> Geometry:
     """The views of a table of vectors, in the rows and with the binning of the selection."""
     from recon.base.vectors import geometry_of_vectors
 
@@ -191,31 +194,31 @@ def _of_vectors(table: PoseTable, source: ScanSource, selection: Selection) -> G
         views = geometry_of_vectors(table.vectors, source.shape, cone=table.cone)
     except ValueError as error:
         raise DataError(f"{table.path}: {error}. Nothing was read.") from error
-    if table.cone != (cone_of(source, selection) is not None):
+    if table.cone != (selection.cone is not None):
         need = f"give --cone {views.sod:.6g}:{views.sdd:.6g}" if table.cone else "give vectors with src_x to v_z"
         beam = "a cone" if table.cone else "a parallel beam"
         raise ConfigError(f"{table.path} has vectors of {beam}, and {source.path} is not said to be one: {need}.")
-    size = pixel_size(source, selection)
+    size = selection.pixel_size_mm
     if size is None or abs(size - views.pixel_pitch) > _SAME_SIZE * size:
         stated = "does not say its pixel size" if size is None else f"has pixels of {1e3 * size:.6g} um"
         raise ConfigError(
             f"{table.path} has vectors of pixels of {1e3 * views.pixel_pitch:.6g} um, {source.path} {stated}; expected "
             "the same in mm. Give --pixel-size-um, or vectors in mm."
         )
-    rows = rows_of(source, selection)
+    rows = selection.detector_rows
     return views.rows(rows.start, rows.stop).binned(selection.binning)
 
 
-def _pixels(table: PoseTable, source: ScanSource, selection: Selection) -> float:
+def _pixels(table: PoseTable, source: ScanSource, selection: ScanSelection) -> float:
     """Pixels of the unbinned detector in the table's unit."""
     if table.unit == "px":
         return 1.0
-    if cone_of(source, selection) is not None:
+    if selection.cone is not None:
         raise DataError(
             f"{table.path}: translations of the sample in mm are no shifts of a cone's views, whose matter is "
             "magnified by its depth. Give a CSV of shifts in pixels. Nothing was read."
         )
-    size = pixel_size(source, selection)
+    size = selection.pixel_size_mm
     if size is None:
         raise DataError(f"{table.path} is in mm, and {source.path} does not say its pixel size: give --pixel-size-um.")
     return 1 / size
@@ -259,10 +262,10 @@ def _rows(table: PoseTable, source: ScanSource, frames: I64) -> I64:
     return row_of_frame
 
 
-def require_stated(poses: ScanPoses, source: ScanSource, selection: Selection, view_ids: I64) -> None:
+def require_stated(poses: ScanPoses, source: ScanSource, view_ids: I64) -> None:
     """Raise DataError if views lack a pose."""
-    unknown, table = view_ids[~poses.stated(view_ids)], stated_poses(source, selection)
-    if unknown.size and table is not None:
+    unknown, table = view_ids[~poses.stated(view_ids)], poses.table
+    if unknown.size:
         degrees = np.degrees(source.table.angles[unknown[0]])
         raise DataError(
             f"{table.path} states no pose of {unknown.size} of the {view_ids.size} views chosen of {source.path} "

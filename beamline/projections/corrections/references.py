@@ -15,15 +15,8 @@ from beamline.core.text import count, spans
 from beamline.monitor.evidence import BRIGHT
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.read import read_binned, spoilt_frames
-from beamline.projections.selection import Selection
-from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.references import (
-    ReferenceGroups,
-    by_exposure,
-    exposures_of,
-    usual_exposure,
-    views_differ,
-)
+from beamline.projections.selection import ScanSelection
+from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
 from recon.prep.correct import References
 from recon.prep.dynamic_flats import find_dynamic_flats
@@ -42,7 +35,7 @@ class _Reading:
         spots: pixels of bright spots, by frame.
     """
 
-    source: ScanSource
+    scan: ScanEvidence
     rows: slice
     binning: int
     use_damaged: bool
@@ -50,10 +43,11 @@ class _Reading:
     spots: dict[int, int] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, source: ScanSource, groups: ReferenceGroups, rows: slice, selection: Selection) -> _Reading:
-        binning, flat = selection.binning, read_binned(source, groups.flats[0][:1], rows, selection.binning)
+    def of(cls, scan: ScanEvidence, rows: slice, selection: ScanSelection) -> _Reading:
+        binning = selection.binning
+        flat = read_binned(scan.source, scan.used.flats[0][:1], rows, binning)
         light = float(np.percentile(np.nan_to_num(flat), BRIGHT))
-        return cls(source, rows, binning, not selection.step(Preparation).uses_flags, light)
+        return cls(scan, rows, binning, not selection.step(Preparation).uses_flags, light)
 
     def images(self, frames: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[Any]]]:
         """The frames [row, col] that may be used, one by one, without bright spots."""
@@ -61,8 +55,8 @@ class _Reading:
 
         def good() -> Iterator[NDArray[Any]]:
             for frame in frames.tolist():
-                image = read_binned(self.source, np.array([frame]), self.rows, self.binning)[0]
-                if frame not in spoilt_frames(self.source, self.use_damaged):
+                image = read_binned(self.scan.source, np.array([frame]), self.rows, self.binning)[0]
+                if frame not in spoilt_frames(self.scan.source, self.use_damaged):
                     used.append(frame)
                     yield image
 
@@ -82,16 +76,12 @@ class _Reading:
 
     def darks(self, frames: NDArray[np.int64]) -> list[tuple[float, NDArray[np.float64]]]:
         """The mean dark of each exposure; of all, with NaN for their exposure, where they have one or it is unknown."""
-        means = [(seconds, self.mean(some)) for seconds, some in by_exposure(self.source, frames)]
+        means = [(seconds, self.mean(some)) for seconds, some in self.scan.by_exposure(frames)]
         return [(seconds, mean) for seconds, mean in means if mean is not None]
 
 
 def read_references(
-    source: ScanSource,
-    groups: ReferenceGroups,
-    rows: slice,
-    selection: Selection,
-    warn: Warn = lambda sentence: None,
+    scan: ScanEvidence, rows: slice, selection: ScanSelection, warn: Warn = lambda sentence: None
 ) -> References:
     """Read the mean dark, and the mean of each group of flats with its position in the scan; both kinds are required.
 
@@ -103,28 +93,28 @@ def read_references(
     Raises:
         DataError: all frames of a kind are damaged.
     """
-    reading = _Reading.of(source, groups, rows, selection)
-    darks = reading.darks(np.concatenate(groups.darks))
-    dark = _dark_of(usual_exposure(source), darks)
-    scale = light_scale(source, selection.step(Preparation).by_current)
+    reading = _Reading.of(scan, rows, selection)
+    darks = reading.darks(np.concatenate(scan.used.darks))
+    dark = _dark_of(scan.usual_exposure, darks)
+    scale = light_scale(scan, selection.step(Preparation).by_current)
     flats = []
-    for group in groups.flats:
+    for group in scan.used.flats:
         mean = reading.mean(group, scale)
         if dark is not None and mean is not None:
-            used = np.setdiff1d(group, spoilt_frames(source, reading.use_damaged))
-            own, light = _dark_of(float(np.median(source.table.exposures[used])), darks), scale[used].mean()
+            used = np.setdiff1d(group, spoilt_frames(scan.source, reading.use_damaged))
+            own, light = _dark_of(float(np.median(scan.table.exposures[used])), darks), scale[used].mean()
             net = (1 - light) * dark if own is dark or own is None else dark - light * own
             flats.append((float(used.mean()), (mean + net).astype(np.float32)))
     if dark is None or not flats:
         raise DataError(
-            f"{source.path}: all {'darks' if dark is None else 'flats'} are damaged: they cannot be read, or are not "
-            "what was written, by their checksums. Use a good copy, or --flags ignore, which takes the latter."
+            f"{scan.source.path}: all {'darks' if dark is None else 'flats'} are damaged: they cannot be read, or are "
+            "not what was written, by their checksums. Use a good copy, or --flags ignore, which takes the latter."
         )
     if reading.spots:
         n, frames = sum(reading.spots.values()), spans(sorted(reading.spots))
         spots = f"Bright spots of single darks and flats (zingers: {count(n, 'pixel')} in frames {frames})"
         warn(Note(f"{spots} were filled from the frames beside them."))
-    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(source.table.part_starts.tolist()))
+    return References(dark.astype(np.float32), tuple(flats), part_starts=tuple(scan.table.part_starts.tolist()))
 
 
 def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) -> NDArray[np.float64] | None:
@@ -135,41 +125,39 @@ def _dark_of(exposure: float, darks: list[tuple[float, NDArray[np.float64]]]) ->
     return dark_at(exposure, darks) if exposure > 0 else np.asarray(np.mean([dark for _, dark in darks], axis=0))
 
 
-def with_dynamic_flats(
-    source: ScanSource, groups: ReferenceGroups, references: References, rows: slice, selection: Selection
-) -> References:
-    """The same references with the principal components of all flats of these groups, which are read three times.
+def with_dynamic_flats(scan: ScanEvidence, references: References, rows: slice, selection: ScanSelection) -> References:
+    """The same references with the principal components of all flats that are used, which are read three times.
 
     Raises:
         ConfigError: there are too few flats.
     """
 
     asked = selection.step(Preparation)
-    frames = np.setdiff1d(np.concatenate(groups.flats), spoilt_frames(source, not asked.uses_flags))
-    scale = light_scale(source, asked.by_current)
-    reading = _Reading.of(source, groups, rows, selection)
-    darks = reading.darks(np.concatenate(groups.darks))
+    frames = np.setdiff1d(np.concatenate(scan.used.flats), spoilt_frames(scan.source, not asked.uses_flags))
+    scale = light_scale(scan, asked.by_current)
+    reading = _Reading.of(scan, rows, selection)
+    darks = reading.darks(np.concatenate(scan.used.darks))
 
     def flats() -> Iterator[NDArray[np.float32]]:
         for frame, image in reading.images(frames):
-            dark = references.dark if len(darks) < 2 else _dark_of(float(source.table.exposures[frame]), darks)
+            dark = references.dark if len(darks) < 2 else _dark_of(float(scan.table.exposures[frame]), darks)
             yield ((image - dark) * np.float32(scale[frame])).astype(np.float32)
 
     masked = dead_pixels(references.dark, [flat for _, flat in references.flats], asked.hot_threshold)
     try:
         dynamic = find_dynamic_flats(flats, np.random.default_rng(selection.seed), masked)
     except ValueError as error:
-        raise ConfigError(f"--flat-fields dynamic: {source.path}: {error}. Leave it out.") from error
+        raise ConfigError(f"--flat-fields dynamic: {scan.source.path}: {error}. Leave it out.") from error
     return replace(references, dynamic=dynamic)
 
 
-def light_scale(source: ScanSource, by_current: bool = False) -> NDArray[np.float64]:
+def light_scale(scan: ScanEvidence, by_current: bool = False) -> NDArray[np.float64]:
     """Factor [frame] that scales each frame from its own exposure to the projections' median; 1 if one is unknown. With
     `by_current` also from its own ring current.
     """
 
-    scale = _to_median(exposures_of(source), source.table.views)
-    return scale * current_scale(source) if by_current else scale
+    scale = _to_median(scan.exposures, scan.table.views)
+    return scale * current_scale(scan) if by_current else scale
 
 
 def _to_median(values: NDArray[np.float64], views: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -178,27 +166,29 @@ def _to_median(values: NDArray[np.float64], views: NDArray[np.int64]) -> NDArray
     return np.where(np.isfinite(values), np.median(known) / values, 1.0) if known.size else np.ones(values.size)
 
 
-def current_scale(source: ScanSource) -> NDArray[np.float64]:
+def current_scale(scan: ScanEvidence) -> NDArray[np.float64]:
     """Factor [frame] that scales each frame from its own ring current to the median of the projections'.
 
     Raises:
         ConfigError: the file has none for some view or flat.
     """
-    used = source.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
-    currents = source.table.currents
+    used = scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)
+    currents = scan.table.currents
     if currents is None or not np.isfinite(currents[used]).all():
         lacking = "no ring current" if currents is None else "no ring current for some views or flats"
-        raise ConfigError(f"--ring-current use: {source.path} has {lacking} (control/data of NXtomo). Leave it out.")
-    return _to_median(currents, source.table.views)
+        raise ConfigError(
+            f"--ring-current use: {scan.source.path} has {lacking} (control/data of NXtomo). Leave it out."
+        )
+    return _to_median(currents, scan.table.views)
 
 
-def uncorrected_current(source: ScanSource, selection: Selection) -> str:
+def uncorrected_current(scan: ScanEvidence, selection: ScanSelection) -> str:
     """The warning that the ring current changed between flats and views and is not corrected; "" if it did not
     change."""
-    known = source.table.currents
-    if source.quantity != "counts" or selection.step(Preparation).by_current or known is None:
+    known = scan.table.currents
+    if not scan.in_counts or selection.step(Preparation).by_current or known is None:
         return ""
-    currents = known[source.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)]
+    currents = known[scan.table.of_kind(FrameKind.PROJECTION, FrameKind.FLAT)]
     if not currents.size or not (currents > 0).all() or currents.max() < (1 + _STEADY) * currents.min():
         return ""
     return (
@@ -207,15 +197,15 @@ def uncorrected_current(source: ScanSource, selection: Selection) -> str:
     )
 
 
-def flats_sentence(source: ScanSource, references: References, by_current: bool) -> str:
+def flats_sentence(scan: ScanEvidence, references: References, by_current: bool) -> str:
     """How changes of the beam and of the exposure were corrected, in words; empty if they were not."""
 
     sentences = []
-    if views_differ(source):
-        views = source.table.exposures[source.table.views]
+    if scan.views_differ:
+        views = scan.table.exposures[scan.table.views]
         sentences.append(f"Exposures of the views: {views.min():g} to {views.max():g} s; corrected.")
     if by_current:
-        currents = 1 / current_scale(source)[source.table.views]
+        currents = 1 / current_scale(scan)[scan.table.views]
         sentences.append(
             f"Ring current of the views: {currents.min():.3f} to {currents.max():.3f} times its median; corrected."
         )
@@ -229,12 +219,12 @@ def flats_sentence(source: ScanSource, references: References, by_current: bool)
     return " ".join(sentences)
 
 
-def warn_of_parts_without_flats(source: ScanSource, references: References, warn: Warn) -> None:
+def warn_of_parts_without_flats(scan: ScanEvidence, references: References, warn: Warn) -> None:
     """A warning for each part of the scan whose views are corrected by the flats of another part."""
-    starts = source.table.part_starts
+    starts = scan.table.part_starts
     flats = [position for position, _ in references.flats]
-    for start, end in zip(starts, [*starts[1:], len(source.table)], strict=True):
-        has_views = source.table.views_of(start, end).size
+    for start, end in zip(starts, [*starts[1:], len(scan.table)], strict=True):
+        has_views = scan.table.views_of(start, end).size
         if has_views and not any(start <= position < end for position in flats):
             warn(
                 f"Frames {start}-{end - 1}, a part of the scan, have no usable flats. The "

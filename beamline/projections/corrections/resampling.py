@@ -13,7 +13,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import text_in
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import BlurringStep, ScanPart, ViewFilter
-from beamline.projections.selection import Selection, cone_of
+from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone, StepMemory, option
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from beamline.core.sinks import Warn
     from beamline.projections.tilt import BandsDone
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.prep import resample
     from recon.prep.correct import Projections
 
@@ -110,7 +111,7 @@ class TiltAndLens:
         search = _search_memory(part.source, part.selection) if self.sought else 0
         return StepMemory(copies * part.view_bytes(steepest.reach), search)
 
-    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
+    def on(self, source: ScanSource, selection: ScanSelection) -> tuple[ViewFilter | None, StepDone]:
         resampling = self.of(source, selection)
         if resampling is None:
             return None, self.done("")
@@ -129,7 +130,7 @@ class TiltAndLens:
             parameters[f"distortion_{name}"] = value if isinstance(value, float) else str(value)
         return StepDone(sentence, parameters)
 
-    def of(self, source: ScanSource, selection: Selection) -> resample.Resampling | None:
+    def of(self, source: ScanSource, selection: ScanSelection) -> resample.Resampling | None:
         """The resampling of the views; None if they are used as recorded.
 
         Raises:
@@ -137,7 +138,7 @@ class TiltAndLens:
         """
         from recon.prep.resample import Resampling
 
-        if (self.tilt_deg or self.sought) and cone_of(source, selection) is not None:
+        if (self.tilt_deg or self.sought) and selection.cone is not None:
             raise ConfigError(f"--tilt is for a parallel beam; {source.path} is a cone. Leave it out.")
         if not self.tilt_deg and self.distortion is None:
             return None
@@ -148,8 +149,8 @@ class TiltAndLens:
 
 
 def with_tilt(
-    source: ScanSource, selection: Selection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
-) -> tuple[Selection, str]:
+    scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
+) -> tuple[ScanSelection, str]:
     """The selection with the tilt found from all detector rows, if it asks for that; and a sentence about it.
 
     The sentence is empty where the tilt was not asked for.
@@ -167,12 +168,13 @@ def with_tilt(
     from recon.prep.tilt import STEEPEST
 
     step = selection.step(TiltAndLens)
+    source = scan.source
     step.of(source, selection)  # refuses a cone
     if not step.sought:
         return selection, ""
     rows, frames = source.shape[0] // selection.binning, spread_views(source.table.angles[frames], _VIEWS, frames)
     try:
-        tilt, uncertainty = _refined(source, replace(selection, rows=None), frames, progress)
+        tilt, uncertainty = _refined(scan, replace(selection, rows=None), frames, progress)
     except ValueError as error:
         raise DataError(
             f"{source.path}: the tilt of the axis was not found: {error}. Give it with --tilt DEGREES, or leave it out."
@@ -190,7 +192,7 @@ def with_tilt(
     return selection.with_steps(replace(step, tilt=math.degrees(tilt))), f"{lean}; views are turned."
 
 
-def _search_memory(source: ScanSource, selection: Selection) -> int:
+def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
     """Bytes that `with_tilt` takes at most, if it is to find the tilt."""
     from beamline.projections.correction import at_once_memory
     from recon.prep.tilt import STEEPEST
@@ -205,7 +207,7 @@ def _search_memory(source: ScanSource, selection: Selection) -> int:
 
 
 def _refined(
-    source: ScanSource, selection: Selection, frames: NDArray[np.int64], progress: BandsDone
+    scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64], progress: BandsDone
 ) -> tuple[float, float]:
     """The tilt by views that were levelled by the tilt of the last round, and its uncertainty; radians.
 
@@ -216,12 +218,13 @@ def _refined(
     from beamline.projections.tilt import shown_tilt
 
     plain, step = _without_blur(selection), selection.step(TiltAndLens)
-    rows = (source.shape[0] if selection.rows is None else np.ptp(selection.rows)) / selection.binning
+    rows = scan.source.shape[0] / selection.binning
     tilt = 0.0
     for n in range(_ROUNDS):
-        levelled = ScanCorrection(source, plain.with_steps(replace(step, tilt=math.degrees(tilt))), lambda _: None)
+        turned = plain.with_steps(replace(step, tilt=math.degrees(tilt)))
+        levelled = ScanCorrection(scan, turned, lambda _: None, frames)
         residual = shown_tilt(
-            source, levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress)
+            scan.source, levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress)
         )
         tilt += residual.tilt
         if abs(residual.tilt) < residual.uncertainty / 4 or abs(residual.tilt) * rows < _NOTHING / 2:
@@ -229,7 +232,7 @@ def _refined(
     return tilt, residual.uncertainty
 
 
-def _without_blur(selection: Selection) -> Selection:
+def _without_blur(selection: ScanSelection) -> ScanSelection:
     """The selection without the corrections that blur the views."""
     sharp = tuple(step for step in selection.steps if not isinstance(step, BlurringStep))
     logarithms = replace(selection.step(Preparation), noise="log", gain=None)

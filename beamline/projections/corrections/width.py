@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from beamline.projections.selection import Selection
+    from beamline.projections.selection import ScanSelection
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.recon_record import Value
     from recon.base.geometry import Geometry
@@ -96,7 +96,7 @@ class Width:
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory()
 
-    def rays(self, source: ScanSource, selection: Selection, geometry: Geometry) -> tuple[Geometry, StepDone]:
+    def rays(self, source: ScanSource, selection: ScanSelection, geometry: Geometry) -> tuple[Geometry, StepDone]:
         """The geometry with the width of the rays; angles become those of the middle of the exposure.
 
         Raises:

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding, Severity
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.units import look_like_degrees
 
 FARTHEST = 1e6  # degrees
@@ -20,31 +20,19 @@ _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
 _FEWEST, _MANY = 5, 30  # views from which on a span tells a unit: if it is a turn in that unit, and in any case
 
 
-def angles_known(source: ScanSource) -> Iterator[Finding]:
-    """Every projection has a finite angle, in a sense that is certain."""
-    views = source.table.views
-    unknown = views[~np.isfinite(source.table.angles[views])]
-    if unknown.size:
-        why = source.attributes.get("angles", "")
-        yield Finding(
-            "error",
-            "angles",
-            f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]})"
-            + (f"; {why}" if why else "")
-            + ". Give them with --angles FILE (degrees, one a line).",
-        )
-    if where := source.attributes.get("angles_reversed"):
-        yield Finding(
-            "warning",
-            "angles",
-            f"The angles of {where} are taken in the reverse sense, as the vector of their axis is negative. "
-            f"--angles-path {where} takes them as they stand; the volume is then the mirror image of this one.",
-        )
+def angles_unknown(scan: ScanEvidence) -> str:
+    """Which projections have no finite angle."""
+    unknown = np.setdiff1d(views := scan.table.views, scan.table.views_with_angles)
+    why = f"; {why}" if (why := scan.source.attributes.get("angles")) else ""
+    return "" if not unknown.size else (
+        f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]}){why}. Give them with "
+        "--angles FILE (degrees, one a line)."
+    )  # fmt: skip
 
 
-def angles_spread(source: ScanSource) -> Iterator[Finding]:
+def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
     """The projections have different directions, over half a turn, and their angles may be in degrees."""
-    angles = source.table.angles[source.table.views]
+    angles = scan.table.angles[scan.table.views]
     if angles.size < 2 or not np.isfinite(angles).all():
         return
     farthest = float(np.abs(angles).max()) * 180 / np.pi
@@ -64,7 +52,7 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
         return
     step = span / (distinct.size - 1)
     # A plan is of our own scans, whose angles are in degrees.
-    severity: Severity = "warning" if source.plan else "error"
+    severity: Severity = "warning" if scan.source.plan else "error"
     between = float(np.median(np.abs(np.diff(degrees))))
     if look_like_degrees(angles):
         yield Finding(
@@ -96,7 +84,7 @@ def angles_spread(source: ScanSource) -> Iterator[Finding]:
             "warning",
             "angle-spread",
             f"The projections {span_text} (limited angle): {unseen:.4g} of 180 degrees have no view."
-            + (_COUNTED if not source.plan and np.allclose(degrees, np.arange(angles.size)) else ""),
+            + (_COUNTED if not scan.source.plan and np.allclose(degrees, np.arange(angles.size)) else ""),
         )
 
 

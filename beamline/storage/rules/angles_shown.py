@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.evidence import lit_places
-from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
-from beamline.storage.rules.references import LEAST, VIEWS, ViewLight, brightness, reference_groups, seen_frame
+from beamline.storage.rules.evidence import LEAST, VIEWS, ScanEvidence, brightness
 from drivers.base.frame import FrameKind
 from recon.base.views import spread
 from recon.prep.align import mirror_mismatch
@@ -44,8 +43,7 @@ class CoarseViews:
         degrees: float64 [frame], as stated.
     """
 
-    source: ScanSource
-    light: ViewLight
+    scan: ScanEvidence
     rows: NDArray[np.int64]
     degrees: NDArray[np.float64]
     _depths: dict[int, NDArray[np.float64]] = field(default_factory=dict)
@@ -60,24 +58,24 @@ class CoarseViews:
         return self._depths[row]
 
     def _lines(self, row: int) -> NDArray[np.float64]:
-        cells = seen_frame(self.source, row).cells
-        assert cells is not None
-        if self.light.dark is None or self.light.flat is None:
+        cells = self.scan.frame(row).places
+        if self.scan.beam is None:
             return np.nan_to_num(cells.astype(np.float64))
-        beam = np.nan_to_num(self.light.flat - self.light.dark)
+        dark, flat = self.scan.beam
+        beam = np.nan_to_num(flat - dark)
         least = _LEAST_LIGHT * max(float(beam.max()), 1e-30)
-        seen = np.nan_to_num(cells - self.light.dark)
+        seen = np.nan_to_num(cells - dark)
         return np.asarray(-np.log(np.maximum(seen, least) / np.maximum(beam, least)), np.float64)
 
     def _is_lit(self, row: int) -> bool:
-        cells, dark, flat = seen_frame(self.source, row).cells, self.light.dark, self.light.flat
-        if cells is None or dark is None or flat is None:
+        if self.scan.beam is None:
             return bool(np.ptp(self._lines(row)))
+        cells, (dark, flat) = self.scan.frame(row).places, self.scan.beam
         if (lit := lit_places(flat - dark)).any():  # opaque from top to bottom, as what is not of the sample
             posts = ((cells - dark < DARK * (flat - dark)) | ~lit).all(axis=0) & lit.any(axis=0)
             if posts.any():
                 return False
-        return brightness(cells, dark, flat) > LEAST * self.light.usual
+        return brightness(cells, dark, flat) > LEAST * self.scan.brightest
 
     def lit(self, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether views have light and show a sample [view]."""
@@ -112,23 +110,22 @@ class CoarseViews:
         return float(np.median([self.unlike(pair) for pair in pairs]))
 
 
-def coarse_views(source: ScanSource) -> CoarseViews | None:
+def coarse_views(scan: ScanEvidence) -> CoarseViews | None:
     """The coarse views of a scan, if it has enough views, and their line integrals are known."""
-    views = source.table.views_with_angles
-    counts = source.quantity == "counts"
-    if source.quantity == "unknown" or source.table.shifts is not None:
+    views = scan.table.views_with_angles
+    if scan.source.quantity == "unknown" or scan.table.shifts is not None:
         return None
-    lacking = counts and not source.table.has(FrameKind.DARK, FrameKind.FLAT)
-    if lacking or min(source.shape[1], views.size) < _LEAST_SEEN:
+    lacking = scan.in_counts and not scan.table.has(FrameKind.DARK, FrameKind.FLAT)
+    if lacking or min(scan.source.shape[1], views.size) < _LEAST_SEEN:
         return None
-    light = ViewLight.of(source, reference_groups(source) if counts else None)
-    views = np.array([row for row in views.tolist() if row not in source.unreadable], np.int64)
-    return CoarseViews(source, light, views, np.degrees(source.table.angles)) if views.size >= _LEAST_SEEN else None
+    _ = scan.brightest  # by frames of which some may turn out to be unreadable
+    views = np.array([row for row in views.tolist() if row not in scan.source.unreadable], np.int64)
+    return CoarseViews(scan, views, np.degrees(scan.table.angles)) if views.size >= _LEAST_SEEN else None
 
 
-def angles_shown(source: ScanSource) -> Iterator[Finding]:
+def angles_shown(scan: ScanEvidence) -> Iterator[Finding]:
     """Views show the turns, and the order of angles, that the file states."""
-    if (seen := coarse_views(source)) is not None:
+    if (seen := coarse_views(scan)) is not None:
         yield from angles_stand(seen)
         yield from angles_seen(seen)
         yield from angles_in_order(seen)
@@ -169,7 +166,7 @@ def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
     Their rays see the same from both sides, whatever the sample is, also one that is wider than the field. How much
     neighbours differ tells what a turn does to this sample, and what noise does: a round sample shows no angle.
     """
-    if seen.source.cone is not None:
+    if seen.scan.cone is not None:
         return
     views = seen.rows[np.argsort(seen.degrees[seen.rows], kind="stable")]
     some = _some_lit(seen, views)
@@ -183,7 +180,7 @@ def angles_seen(seen: CoarseViews) -> Iterator[Finding]:
         return
     near = seen.typical(list(zip(some[chosen].tolist(), beside[chosen].tolist(), strict=True)))
     if (turn := _turn_seen(seen, views, some, near)) is not None:
-        yield _angles_finding(seen.source, seen.degrees[views], turn)
+        yield _angles_finding(seen.scan, seen.degrees[views], turn)
 
 
 def _some_lit(seen: CoarseViews, views: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -236,7 +233,7 @@ def _turn_seen(seen: CoarseViews, views: NDArray[np.int64], some: NDArray[np.int
     return _Turn((min(end, nearest), max(end, nearest)), turned, stated[len(stated) // 2] if stated else None)
 
 
-def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Turn) -> Finding:
+def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Turn) -> Finding:
     known = [factor for factor in _FACTORS if abs(turn.degrees - 180 * factor) < np.ptp(degrees) / VIEWS]
     counted = np.allclose(degrees, np.arange(degrees.size))
     if counted:
@@ -251,7 +248,7 @@ def _angles_finding(source: ScanSource, degrees: NDArray[np.float64], turn: _Tur
         pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated 180 degrees apart, are not"
     # A plan is of our own scans, whose angles are in degrees. Without views stated half a turn apart, a sample that is
     # symmetric may look so, too; and mistakes are by one of these factors, while a sample that moves may show any.
-    sure = not source.plan and turn.stated is not None and (counted or bool(known))
+    sure = not scan.source.plan and turn.stated is not None and (counted or bool(known))
     which = "The" if sure else "Unless the sample moved or is symmetric, the"
     return Finding(
         "error" if sure else "warning",
@@ -331,4 +328,4 @@ def _in_another_order(seen: CoarseViews, jumps: NDArray[np.int64], far: Pair, ne
         "The angles are not in the order of the frames. Give one for each projection, in their order, with "
         "--angles FILE."
     )
-    return Finding("warning" if seen.source.plan else "error", ORDER, text)
+    return Finding("warning" if seen.scan.source.plan else "error", ORDER, text)

@@ -1,9 +1,10 @@
-"""Light: views and references must be of one light, and each view of one scale; what else explains their counts."""
+"""Light: good references, of one light with the views, each of one scale; what else explains their counts."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,20 +12,10 @@ from numpy.typing import NDArray
 from beamline.core.flag import Finding
 from beamline.monitor.evidence import BRIGHT, DRIFT, lights_in_turn, lit_places, place_noise
 from beamline.monitor.references import LIT, LIT_SIGMAS, ReferenceLimits
-from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.readers.base import read_known
 from beamline.storage.readers.no_data import counts_photons
 from beamline.storage.readers.transforms import frames_by_energy, in_words, selected
-from beamline.storage.rules.references import (
-    EXPOSURE_TOLERANCE,
-    ReferenceGroups,
-    cells_of,
-    exposures_of,
-    groups_taken,
-    mean_cells,
-    reference_groups,
-    usual_exposure,
-    views_differ,
-)
+from beamline.storage.rules.evidence import EXPOSURE_TOLERANCE, ScanEvidence
 from recon.base.arrays import F32, F64, I64
 from recon.base.noise import deviation_between_frames
 from recon.base.views import spread
@@ -47,14 +38,36 @@ MORE_LIGHT, HIGHER = 0.1, 0.01  # of flats and darks, shares of the light: examp
 """Limits, each with its reason."""
 
 
-def views_scaled(source: ScanSource) -> Iterator[Finding]:
+def references_usable(scan: ScanEvidence) -> Iterator[Finding]:
+    """Flats are lit, complete and even, and darks are dark; a faulty group is left out if there is a good one.
+
+    An error where all groups of a kind are bad, a warning for others that have a fault, and for all that are accepted.
+    """
+    for finding in scan.findings:
+        message = finding.message
+        if finding.frames:
+            name = f"{scan.table.kind(finding.frames[0]).name.lower()}s"
+            if scan.asked.accepted:
+                message = f"--references accept: {message}"
+            elif finding.severity == "error":
+                message += (
+                    f" It must not be reconstructed: take new {name}, or give others with --{name}; `beamline recon "
+                    "--references accept` uses these as they are."
+                )
+            else:
+                message += f" The other {name} are used instead."
+        severity = "warning" if scan.asked.accepted else finding.severity
+        yield replace(finding, severity=severity, rule="bad-references", message=message)
+
+
+def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
     """Each view was rescaled on its own: all have the same least and largest number, at different pixels."""
-    rows = source.table.views
+    rows = scan.table.views
     if rows.size < VIEWS:
         return
     ends, places = set(), (set[int](), set[int]())
     for row in spread(rows, VIEWS).tolist():
-        view = read_known(source, [row])[0]
+        view = read_known(scan.source, [row])[0]
         low, high = float(view.min()), float(view.max())
         ends.add((low, high))
         whole = view.dtype.kind in "ui"
@@ -77,13 +90,10 @@ def views_scaled(source: ScanSource) -> Iterator[Finding]:
     )
 
 
-def light_beside_flats(
-    source: ScanSource, groups: ReferenceGroups, level: float, air: bool, accepted: bool = False
-) -> Iterator[Finding]:
+def light_beside_flats(scan: ScanEvidence, level: float, air: bool, accepted: bool = False) -> Iterator[Finding]:
     """The air of views is as bright as their flats, apart from the usual drift of a beam during a scan.
 
     Args:
-        groups: the references that are used.
         level: line integral of the air, the median of the views; without air, of the place that absorbs least.
         air: columns of air were found, whose light was taken off.
         accepted: a fault is a warning.
@@ -97,7 +107,7 @@ def light_beside_flats(
             f"{where} is {factor:.3g} times as {'dark' if level > 0 else 'bright'} as the flats ({level:+.2f} of line "
             f"integral, {what}); within a scan a beam changes by up to {math.exp(WARN):.2g} times, and a sample only "
             f"takes light. Were views and references taken and stored in the same way? "
-            f"{_counts_in_words(source, groups)}"
+            f"{_counts_in_words(scan)}"
         )
         refused = abs(level) > REFUSE
         if darker:
@@ -105,30 +115,24 @@ def light_beside_flats(
         if refused and not accepted:
             sentence += " Give references of the views' light, or --references accept, which uses these as they are."
         yield Finding("error" if refused and not accepted else "warning", "light", sentence)
-    elif not air and (ratio := _noise_ratio(source, groups)) > NOISIER:
+    elif not air and (ratio := _noise_ratio(scan)) > NOISIER:
         yield Finding(
             "warning",
             "light",
             f"Relative to their counts the flats have {ratio:.2g} times the noise of the views, though one camera has "
             f"one figure for all images, and no air shows which is right: references that were multiplied (by about "
-            f"{ratio:.2g}), or views that are means of several frames? {_counts_in_words(source, groups)}",
+            f"{ratio:.2g}), or views that are means of several frames? {_counts_in_words(scan)}",
         )
 
 
-def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[Finding]:
-    """Darks are images, nowhere brighter than the views, and air is not saturated.
-
-    Args:
-        accepted: all are used as they are, so that a fault is a warning.
-    """
-    if source.quantity != "counts":
+def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
+    """Darks are images, nowhere brighter than the views, and air is not saturated."""
+    if scan.beam is None:
         return
-    groups = groups_taken(source) if accepted else reference_groups(source)
-    if not (groups.darks and groups.flats):
-        return
-    of_darks, of_flats = np.concatenate(groups.darks), np.concatenate(groups.flats)
-    dark, flat = np.min(cells_of(source, of_darks), axis=0), mean_cells(source, of_flats)  # zingers light single darks
-    if not dark.any() and _change(source, groups) and not counts_photons(source):
+    dark, flat = np.min(scan.cells(np.concatenate(scan.used.darks)), axis=0), scan.beam[1]  # zingers light single darks
+    of_one = max(scan.used.flats, key=len)[:2] if not dark.any() else np.zeros(0, np.int64)
+    two = read_known(scan.source, of_one).astype(np.float64)  # alike where one image was written for them all
+    if len(two) > 1 and deviation_between_frames(two) and not counts_photons(scan.source):
         yield Finding(
             "warning",
             "light",
@@ -140,8 +144,8 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
         return
     light = float(np.percentile((flat - dark)[lit], BRIGHT))
     limit = max(LIT * light, LIT_SIGMAS * place_noise(dark))
-    views = spread(source.table.views, VIEWS)
-    under = [(dark - view)[lit] for view in cells_of(source, views)]
+    views = spread(scan.table.views, VIEWS)
+    under = [(dark - view)[lit] for view in scan.cells(views)]
     deep = [float(np.percentile(each, 100 * (1 - BELOW))) for each in under if np.isfinite(each).all()]
     if np.count_nonzero(np.array(deep) > limit) > OF_VIEWS * VIEWS:
         sentence = (
@@ -149,68 +153,58 @@ def darks_beside_views(source: ScanSource, accepted: bool = False) -> Iterator[F
             f"{light:.4g} of light in the flats), though light only adds: the darks are too high. Were they taken with "
             "light, with another gain or exposure, or stored as sums of frames? Give --darks of the views' settings."
         )
-        sentence += "" if accepted else " --references accept uses these."
-        yield Finding("warning" if accepted else "error", "light", sentence)
+        sentence += "" if scan.asked.accepted else " --references accept uses these."
+        yield Finding("warning" if scan.asked.accepted else "error", "light", sentence)
 
 
-def _middle(source: ScanSource) -> slice:
-    """Rows about the middle, in which noise is looked at."""
-    middle = source.shape[0] // 2
-    return slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
-
-
-def _change(source: ScanSource, groups: ReferenceGroups) -> float:
-    """Noise of a pixel of the flats: 0 of an image that was written for them all, and where a group is a single one."""
-    two = read_known(source, max(groups.flats, key=len)[:2]).astype(np.float64)
-    return deviation_between_frames(two) if len(two) > 1 else 0.0
-
-
-def _counts_in_words(source: ScanSource, groups: ReferenceGroups) -> str:
+def _counts_in_words(scan: ScanEvidence) -> str:
     """Sentences on counts and exposures of flats and views, where views are brightest."""
-    views = spread(source.table.views, VIEWS)
-    flats = np.concatenate(groups.flats)
-    seen, flat, dark = (mean_cells(source, rows) for rows in (views, flats, np.concatenate(groups.darks)))
+    views = spread(scan.table.views, VIEWS)
+    darks, flats = (np.concatenate(groups) for groups in scan.used)
+    seen, flat, dark = (scan.mean_cells(rows) for rows in (views, flats, darks))
     lit = lit_places(flat - dark)
     places = lit & (seen >= np.percentile(seen[lit], BRIGHT)) if lit.any() else np.ones_like(lit)
     counts = float(np.median(flat[places])), float(np.median(seen[places]))
     there = f"There, counts are {counts[0]:.6g} in the flats and {counts[1]:.6g} in the views."
-    return f"{there} {_exposures_in_words(source, flats, views)}"
+    return f"{there} {_exposures_in_words(scan, flats, views)}"
 
 
-def _exposures_in_words(source: ScanSource, *rows: NDArray[np.int64]) -> str:
+def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
     """A sentence on the exposures that the file states of some flats and views."""
-    exposed = [source.table.exposures[some] for some in rows]
+    exposed = [scan.table.exposures[some] for some in rows]
     if all(np.isfinite(each).all() for each in exposed):
         said = [f"{np.median(each):g} s" for each in exposed]
         return f"Stated exposures: flats {said[0]}, views {said[1]}."
     return "No exposure is stated for both: flats that were exposed for another time differ so."
 
 
-def without_air(source: ScanSource, mean: float) -> str:
+def without_air(scan: ScanEvidence, mean: float) -> str:
     """Sentences on what wrong flats and darks do to line integrals (their mean) of views in which no column is air.
 
     A factor of the light is one constant in every line integral, and may be matter beyond the field as well. Of cans of
     1.5 to 3 times the field, the densities of FBP rise by 0.4 to 0.8 of the share, those of FISTA-TV by 0.9.
     """
-    flats, views = source.table.flats, source.table.views
+    flats, views = scan.table.flats, scan.table.views
     more = math.log1p(MORE_LIGHT)
     return (
         "No column shows air, so that nothing in the views tells whether flats and darks are right: flats with "
         f"{MORE_LIGHT:.0%} more light raise every line integral by {more:.3f}, {more / mean:.0%} of the mean, and "
         f"densities by up to as much; darks higher by {HIGHER:.0%} of the light raise that mean by about "
-        f"{HIGHER * math.expm1(mean):.2g}. {_exposures_in_words(source, flats, views)} Compare a density that is known."
+        f"{HIGHER * math.expm1(mean):.2g}. {_exposures_in_words(scan, flats, views)} Compare a density that is known."
     )
 
 
-def _noise_ratio(source: ScanSource, groups: ReferenceGroups) -> float:
+def _noise_ratio(scan: ScanEvidence) -> float:
     """Variance over light of the flats, over that of the views; 0 where it is not known.
 
     Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
     the sample adds to the variance of views, so that their quietest places count.
     """
-    views = spread(source.table.views, VIEWS)
-    taken = [np.concatenate(groups.darks), spread(max(groups.flats, key=len), VIEWS), views]
-    darks, flats, seen = (read_known(source, some, _middle(source)).astype(np.float32) for some in taken)
+    views = spread(scan.table.views, VIEWS)
+    taken = [np.concatenate(scan.used.darks), spread(max(scan.used.flats, key=len), VIEWS), views]
+    middle = scan.source.shape[0] // 2
+    rows = slice(max(middle - ROWS // 2, 0), middle + ROWS // 2)
+    darks, flats, seen = (read_known(scan.source, some, rows).astype(np.float32) for some in taken)
     if len(flats) < LEAST_FLATS:
         return 0.0
     light = flats.mean(axis=0) - darks.mean(axis=0)
@@ -235,16 +229,16 @@ def _gain(net: F32, light: F32) -> float:
     return float(np.percentile(known, QUIET)) if known.size else math.nan
 
 
-def exposures_agree(source: ScanSource) -> Iterator[Finding]:
+def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
     """Darks have the exposure of the projections, or two exposures from which darks of any other follow."""
-    if source.quantity != "counts":
+    if not scan.in_counts:
         return
-    usual = usual_exposure(source)
-    darks, flats = (source.table.exposures[rows] for rows in (source.table.darks, source.table.flats))
-    if views_differ(source):
-        views = source.table.exposures[source.table.views]
+    usual = scan.usual_exposure
+    darks, flats = (scan.table.exposures[rows] for rows in (scan.table.darks, scan.table.flats))
+    if scan.views_differ:
+        views = scan.table.exposures[scan.table.views]
         known = bool((flats > 0).all())
-        taken = exposures_of(source)[source.table.flats]
+        taken = scan.exposures[scan.table.flats]
         doubt = f"taken for {usual:g} s" + (
             "."
             if known
@@ -271,64 +265,59 @@ _IN_A_ROW, _BESIDE = 12, np.radians(20.0)  # views looked at; between them: a wi
 _AS_GOOD = 0.8  # of the light of the best step, beside its flats: a sample takes as much of others
 
 
-def light_one(source: ScanSource) -> Iterator[Finding]:
+def light_one(scan: ScanEvidence) -> Iterator[Finding]:
     """Views in a row have one light, but for a drift; else which step takes one, with its flats."""
-    flats, views = source.table.flats, source.table.views
+    flats, views = scan.table.flats, scan.table.views
     ends = views[:_IN_A_ROW], views[-_IN_A_ROW:]
     if (
-        source.quantity != "counts"
+        not scan.in_counts
         or not flats.size
         or views.size < _IN_A_ROW
         or any(np.ptp(part) != _IN_A_ROW - 1 for part in ends)
     ):
         return
-    levels = [_light_levels(source, part) for part in ends]
+    levels = [_light_levels(scan, part) for part in ends]
     n, change, most = lights_in_turn(levels[0]), np.ptp(levels[0]), ReferenceLimits().uneven
-    beside = np.median(np.abs(np.diff(source.table.angles[ends[0]]))) <= _BESIDE
+    beside = np.median(np.abs(np.diff(scan.table.angles[ends[0]]))) <= _BESIDE
     if not (beside and n and n == lights_in_turn(levels[1]) and change >= most):
         return
     yield Finding(
-        "error" if lights_in_turn(_light_levels(source, flats[:_IN_A_ROW])) else "warning",
+        "error" if lights_in_turn(_light_levels(scan, flats[:_IN_A_ROW])) else "warning",
         "light",
         f"The views have {n} lights in turn, from frame to frame (from frame {views[0]} on; {np.expm1(change):.0%} "
-        f"apart): thresholds, exposures or energies. A volume can use only one. {_way_of_steps(source, n, most)}",
+        f"apart): thresholds, exposures or energies. A volume can use only one. {_way_of_steps(scan, n, most)}",
     )
 
 
-def _way_of_steps(source: ScanSource, n: int, most: float) -> str:
+def _way_of_steps(scan: ScanEvidence, n: int, most: float) -> str:
     """Which step through the views takes one of so many lights, with its flats."""
-    shares = np.array([_share_of_flats(source, slice(first, None, n), most) for first in range(n)])
+    shares = np.array([_share_of_flats(scan, slice(first, None, n), most) for first in range(n)])
     steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
     if not steps:
         return f"No step, as --frames 0::{n}, takes views with flats of their light: give --darks and --flats, too."
     return f"{' or '.join(steps)} takes one, with its darks and flats (views are counted from 0)."
 
 
-def _light_levels(source: ScanSource, rows: I64) -> F64:
+def _light_levels(scan: ScanEvidence, rows: I64) -> F64:
     """Logarithms of the light of frames [frame]."""
-    darks = source.table.darks
-    dark = mean_cells(source, darks) if darks.size else 0.0
-    light = [np.percentile(np.nan_to_num(cells) - dark, BRIGHT) for cells in cells_of(source, rows)]
+    darks = scan.table.darks
+    dark = scan.mean_cells(darks) if darks.size else 0.0
+    light = [np.percentile(np.nan_to_num(cells) - dark, BRIGHT) for cells in scan.cells(rows)]
     return np.asarray(np.log(np.maximum(light, 1e-30)), np.float64)
 
 
-def _share_of_flats(source: ScanSource, step: slice, most: float) -> float:
+def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
     """Light of the views of a step over that of its flats; 0 where its flats differ, or are darker."""
-    table = selected(source, step).table
-    flats, views = (_light_levels(source, rows[:_IN_A_ROW]) for rows in (table.flats, table.views))
+    table = selected(scan.source, step).table
+    flats, views = (_light_levels(scan, rows[:_IN_A_ROW]) for rows in (table.flats, table.views))
     share = math.exp(np.median(views) - np.median(flats))
     return share if np.ptp(flats) < most and share <= 1 + DRIFT else 0.0
 
 
-def one_energy(source: ScanSource) -> Iterator[Finding]:
-    """All views were taken at one energy, as a volume requires."""
-    if (energies := source.table.energies) is None:
-        return
-    of_views = energies[source.table.views]
-    if len(parts := frames_by_energy(of_views)) > 1:
-        yield Finding(
-            "error",
-            "energies",
-            f"The views were taken at {len(parts)} energies: {in_words(of_views)}; a volume needs one. Choose it, such "
-            f"as --frames energy={parts[0][0]:.6g}, which leaves out all frames of others.",
-        )
+def several_energies(scan: ScanEvidence) -> str:
+    """The energies at which views were taken, of which a volume requires one."""
+    energies = np.zeros(0) if scan.table.energies is None else scan.table.energies[scan.table.views]
+    return "" if len(parts := frames_by_energy(energies)) < 2 else (
+        f"The views were taken at {len(parts)} energies: {in_words(energies)}; a volume needs one. Choose it, such "
+        f"as --frames energy={parts[0][0]:.6g}, which leaves out all frames of others."
+    )  # fmt: skip

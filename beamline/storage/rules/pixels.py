@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from beamline.monitor.digest import LARGEST
 from beamline.storage.hdf5 import UnreadableError
-from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.readers.base import read_known
 from beamline.storage.readers.transforms import WRAPPED, wrapped_edges
 from beamline.storage.rules import Finding
+from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
 from recon.base.units import look_like_counts, look_like_transmission
 from recon.base.views import spread
@@ -27,20 +28,20 @@ _FALLS = (
 )
 
 
-def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
+def numbers_wrapped(scan: ScanEvidence) -> Iterator[Finding]:
     """Whole numbers stay within their type: what is brighter than its largest begins again at 0."""
-    kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if source.dtype.itemsize == 2 else ()
-    samples = {kind: images for kind in kinds if (images := sample(source, kind)) is not None}
+    kinds = (FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK) if scan.source.dtype.itemsize == 2 else ()
+    samples = {kind: images for kind in kinds if (images := sample(scan, kind)) is not None}
     frames, flats = samples.values(), samples.get(FrameKind.FLAT)
     flat = None if flats is None else np.median(flats, axis=0)
-    signed = source.dtype.kind == "i" and source.quantity == "counts"
+    signed = scan.source.dtype.kind == "i" and scan.in_counts
     below = _SURELY_BELOW * np.iinfo(np.int16).min if signed else -np.inf
     dark_too = FrameKind.DARK in samples and samples[FrameKind.DARK].min() < below
     low = 0 if dark_too else sum(int((images < below).sum()) for images in frames)
-    edges = sum(wrapped_edges(images, source.dtype, flat) for images in frames)
+    edges = sum(wrapped_edges(images, scan.source.dtype, flat) for images in frames)
     if not edges and low <= _FEW * sum(images.size for images in frames):
         return
-    least, most = np.iinfo(source.dtype).min, np.iinfo(source.dtype).max
+    least, most = np.iinfo(scan.source.dtype).min, np.iinfo(scan.source.dtype).max
     what = (
         f"{edges} pixels near {most} lie beside ones near {least}" if edges else f"{low} pixels are below {below:.0f}"
     )
@@ -54,40 +55,31 @@ def numbers_wrapped(source: ScanSource) -> Iterator[Finding]:
     )
 
 
-def pixels_as_labelled(source: ScanSource) -> Iterator[Finding]:
-    """Numbers are of the type that the file states."""
-    if wrapped := source.attributes.get("pixels"):
-        yield Finding("warning", "pixels", f"The label of the pixels is wrong or missing: they are {wrapped}.")
-
-
-def quantity_stated(source: ScanSource) -> Iterator[Finding]:
+def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
     """The quantity of the pixels is known: a missing or a second logarithm ruins a volume unnoticed."""
-    if source.quantity == "unknown":
-        note = source.attributes.get("quantity")
+    if scan.source.quantity == "unknown":
+        note = scan.source.attributes.get("quantity")
         note_text = "Nothing says" if note is None else f"The file says only in its own words ({str(note)[:80]!r})"
         yield Finding(
             "error",
             "quantity",
             f"{note_text} whether pixels are counts, transmission or line integrals: say --quantity counts, "
-            "--quantity transmission or --quantity line-integrals." + (f" {_FALLS}" if _falls(source) else ""),
+            "--quantity transmission or --quantity line-integrals." + (f" {_FALLS}" if _falls(scan) else ""),
         )
 
 
-def darks_measured(source: ScanSource) -> Iterator[Finding]:
-    """Darks are images of the camera: no two of its pixels read the same without light."""
-    darks = sample(source, FrameKind.DARK) if source.dtype.kind in "ui" else None
-    if darks is not None and darks.min() == darks.max():
-        yield Finding(
-            "info",
-            CONSTANT_DARKS,
-            f"The darks are {darks.min():g} in every pixel looked at: a constant, not what the camera reads without "
-            "light. If its darks were taken, give them with --darks.",
-        )
+def darks_computed(scan: ScanEvidence) -> str:
+    """Darks that are no images of the camera, of which no two pixels read the same without light."""
+    darks = sample(scan, FrameKind.DARK) if scan.source.dtype.kind in "ui" else None
+    return "" if darks is None or darks.min() < darks.max() else (
+        f"The darks are {darks.min():g} in every pixel looked at: a constant, not what the camera reads without "
+        "light. If its darks were taken, give them with --darks."
+    )  # fmt: skip
 
 
-def pixels_measured(source: ScanSource) -> Iterator[Finding]:
+def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
     """Projections hold finite numbers that are not all the same."""
-    views = sample(source, FrameKind.PROJECTION)
+    views = sample(scan, FrameKind.PROJECTION)
     if views is None:
         return
     finite = np.abs(views, dtype=np.float64) <= LARGEST
@@ -102,9 +94,9 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
             "pixels",
             f"{1 - finite.mean():.3%} of the pixels looked at are NaN, infinite or beyond {LARGEST:g}.",
         )
-    if source.quantity == "line_integrals" and _falls(source):
+    if scan.source.quantity == "line_integrals" and _falls(scan):
         yield Finding("error", "quantity", f"Transmission is given as line integrals. {_FALLS}")
-    elif source.quantity == "line_integrals" and look_like_counts(views):
+    elif scan.source.quantity == "line_integrals" and look_like_counts(views):
         yield Finding(
             "warning",
             "pixels",
@@ -113,21 +105,21 @@ def pixels_measured(source: ScanSource) -> Iterator[Finding]:
         )
 
 
-def _falls(source: ScanSource) -> bool:
+def _falls(scan: ScanEvidence) -> bool:
     """The views look like transmission, which real numbers can be."""
-    views = sample(source, FrameKind.PROJECTION, SHAPES) if source.dtype.kind == "f" else None
+    views = sample(scan, FrameKind.PROJECTION, SHAPES) if scan.source.dtype.kind == "f" else None
     return views is not None and look_like_transmission(views)
 
 
-def sample(source: ScanSource, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:
+def sample(scan: ScanEvidence, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:
     """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None where there is none."""
-    rows = source.table.of_kind(kind)
+    rows = scan.table.of_kind(kind)
     if rows.size == 0:
         return None
     rows = spread(rows, count)
-    middle = source.shape[0] // 2
-    images = read_known(source, rows, slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
-    known = ~np.isin(rows, sorted(source.unreadable))
+    middle = scan.source.shape[0] // 2
+    images = read_known(scan.source, rows, slice(max(middle - 128, 0), middle + 128)).astype(np.float64)
+    known = ~np.isin(rows, sorted(scan.source.unreadable))
     if not known.any():
-        raise UnreadableError(next(iter(source.unreadable.values())))
+        raise UnreadableError(next(iter(scan.source.unreadable.values())))
     return images[known]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,45 +14,51 @@ from beamline.core.text import count, spans
 from beamline.plan.passes import ended_by
 from beamline.storage.interrupted import next_step
 from beamline.storage.parts import is_joined, joined_file_of, other_parts, to_join
-from beamline.storage.readers.base import ScanSource
+from beamline.storage.readers.averaged import JOINED_DEG
+from beamline.storage.readers.base import ScanSource, TakesTooLongError
 from beamline.storage.rules import Finding, Severity
-from beamline.storage.rules.angles import angles_known, angles_spread
+from beamline.storage.rules.angles import angles_spread, angles_unknown
 from beamline.storage.rules.angles_shown import angles_shown
-from beamline.storage.rules.light import exposures_agree, light_one, one_energy, views_scaled
+from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.light import (
+    darks_beside_views,
+    exposures_agree,
+    light_one,
+    references_usable,
+    several_energies,
+    views_scaled,
+)
 from beamline.storage.rules.pixels import (
-    darks_measured,
+    CONSTANT_DARKS,
+    darks_computed,
     numbers_wrapped,
-    pixels_as_labelled,
     pixels_measured,
     quantity_stated,
 )
 from beamline.storage.rules.stored_order import axis_vertical, sinogram_told, views_first
+from beamline.storage.rules.treatment import frames_flagged
 from drivers.base.frame import FrameKind
 
 VARYING = "lengths"  # a rule on those that differ from view to view
+_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one view
 _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
 
 
-def scan_findings(source: ScanSource) -> list[Finding]:
-    """Findings of `SOURCE_RULES` on an open scan."""
-    return [finding for rule in SOURCE_RULES for finding in rule(source)]
-
-
-def scan_ended(source: ScanSource) -> Iterator[Finding]:
+def scan_ended(scan: ScanEvidence) -> Iterator[Finding]:
     """The writer closed the file, and the scan ended as planned; else a remedy, or who ended it."""
-    ending, n = source.ending, count(len(source.table), "frame")
-    if not source.finished:
+    ending, n = scan.source.ending, count(len(scan.table), "frame")
+    if not scan.source.finished:
         sentence = f"The file was not closed: {n} can be trusted."
     elif ending.status in ("stopped", "failed"):
-        planned, taken = source.plan.get("angles_deg", ()), source.table.views.size
+        planned, taken = scan.source.plan.get("angles_deg", ()), scan.table.views.size
         of_plan = f", with {taken} of {len(planned)} views" if isinstance(planned, list) and planned else ""
-        of_plan += "; it had decided against the others" if ended_by(source.decisions) else ""
+        of_plan += "; it had decided against the others" if ended_by(scan.source.decisions) else ""
         sentence = f"The scan ended as {ending.status!r} after {n}{of_plan}. {ending.reason}".strip()
     else:
         if ending.reason:
             yield Finding("info", "ended", ending.reason)
         return
-    yield Finding("warning", "unfinished", f"{sentence} {next_step(source.path)}".strip())
+    yield Finding("warning", "unfinished", f"{sentence} {next_step(scan.source.path)}".strip())
 
 
 def altered_sentence(source: ScanSource) -> str:
@@ -64,25 +71,18 @@ def altered_sentence(source: ScanSource) -> str:
     )
 
 
-def enough_views(source: ScanSource) -> Iterator[Finding]:
-    """A reconstruction needs at least two projections."""
-    n = source.table.views.size
-    if n < 2:
-        yield Finding("error", "views", f"{n} projections: a reconstruction needs at least 2, a good one hundreds.")
-
-
-def references_present(source: ScanSource) -> Iterator[Finding]:
+def references_present(scan: ScanEvidence) -> Iterator[Finding]:
     """Scans of counts have darks and flats."""
-    path = Path(source.path).absolute()
+    path = Path(scan.source.path).absolute()
     others = [each.name for each in path.parent.glob("*/") if each != path] if path.is_dir() else []
     beside = ", ".join(sorted(name for name in others if re.search("dark|flat|white|open.?beam", name.lower()))[:4])
     way = f" Beside it lie {beside}: {path.parent} is read with all of them." if beside else ""
-    if source.quantity != "counts":
-        if source.quantity == "unknown" and way:
+    if not scan.in_counts:
+        if scan.source.quantity == "unknown" and way:
             yield Finding("error", "references", f"Darks and flats may be elsewhere.{way}")
         return
     for name, kind in (("flats", FrameKind.FLAT), ("darks", FrameKind.DARK)):
-        if not source.table.of_kind(kind).size:
+        if not scan.table.of_kind(kind).size:
             yield Finding(
                 "error",
                 "references",
@@ -91,37 +91,19 @@ def references_present(source: ScanSource) -> Iterator[Finding]:
             )
 
 
-def series_complete(source: ScanSource) -> Iterator[Finding]:
-    """Every trigger has a frame, and no number is missing in a series of files."""
-    missing = source.attributes.get("missing_triggers", 0)
-    if missing:
-        yield Finding("warning", "missing-frames", f"{missing} triggers gave no frame; the file lists them.")
-    numbers = source.attributes.get("missing_numbers", "")
-    if numbers:
-        yield Finding("warning", "missing-frames", f"The series of files leaves out the numbers {numbers}.")
-
-
-def scale_known(source: ScanSource) -> Iterator[Finding]:
-    """The pixel size is known; without it a volume has no scale."""
-    if source.pixel_size_mm is None:
-        yield Finding("info", "pixel-size", "No pixel size: lengths will be in pixels, densities per pixel.")
-    elif not 0 < source.pixel_size_mm < 10:
-        yield Finding("error", "pixel-size", f"A pixel size of {source.pixel_size_mm:g} mm cannot be.")
-
-
-def stated_used(source: ScanSource) -> Iterator[Finding]:
+def stated_used(scan: ScanEvidence) -> Iterator[Finding]:
     """Everything that the file states is used or reported: as a warning if it may change the volume."""
-    for field in source.not_used:
+    for field in scan.source.not_used:
         message = f"The file states {field.where}, {field.value}, which is not used: {field.why}."
         severity: Severity = "error" if field.wrong else "warning" if field.doubt else "info"
         yield Finding(severity, VARYING if field.wrong else "not-used", message)
 
 
-def central_ray_taken(source: ScanSource) -> Iterator[Finding]:
+def central_ray_taken(scan: ScanEvidence) -> Iterator[Finding]:
     """The central ray of a cone, which the file states or the caller, meets the middle of the rows, and the axis."""
     ways = ("row", "the middle of the rows", "--central-row"), ("column", "the rotation axis", "--axis")
-    for (side, taken, option), at, n in zip(ways, source.central_ray or (), source.shape, strict=False):
-        if source.cone is not None and abs(at - (n - 1) / 2) > _OFF_MIDDLE * n:
+    for (side, taken, option), at, n in zip(ways, scan.source.central_ray or (), scan.source.shape, strict=False):
+        if scan.cone is not None and abs(at - (n - 1) / 2) > _OFF_MIDDLE * n:
             yield Finding(
                 "warning",
                 f"central-{side}",
@@ -130,9 +112,9 @@ def central_ray_taken(source: ScanSource) -> Iterator[Finding]:
             )
 
 
-def pixels_square(source: ScanSource) -> Iterator[Finding]:
+def pixels_square(scan: ScanEvidence) -> Iterator[Finding]:
     """Pixels are square, or each row is a separate slice."""
-    width, height = source.pixel_size_mm, source.row_pitch_mm
+    width, height = scan.source.pixel_size_mm, scan.source.row_pitch_mm
     if height is None or width == 0:  # a width of 0 is another rule's
         return
     if not width or not 0.01 < height / width < 100:
@@ -140,7 +122,7 @@ def pixels_square(source: ScanSource) -> Iterator[Finding]:
         yield Finding(
             "error", "pixel-height", f"The pixels are {height:g} mm high; their width is {width_text}. That cannot be."
         )
-    elif source.cone is not None:
+    elif scan.cone is not None:
         yield Finding(
             "error",
             "pixel-height",
@@ -155,42 +137,105 @@ def pixels_square(source: ScanSource) -> Iterator[Finding]:
         )
 
 
-def parts_joined(source: ScanSource) -> Iterator[Finding]:
+def joined_views(scan: ScanEvidence) -> str:
+    """Frames of one view that lie so far apart in angle that their mean is blurred."""
+    degrees = float(scan.source.attributes.get(JOINED_DEG, 0.0))
+    blur = np.radians(degrees) * scan.source.shape[1] / 2
+    return "" if blur <= _JOINED_BLUR else (
+        f"--frames-per-view {scan.source.frames_per_view} averages frames that are up to {degrees:.3g} degrees apart, "
+        f"which blurs what lies at the edge of the field by {blur:.0f} pixels. Unless that is meant, give as many "
+        "as the scan took at each angle, or leave it out."
+    )  # fmt: skip
+
+
+def parts_joined(scan: ScanEvidence) -> Iterator[Finding]:
     """The file is not a single part of a resumed scan."""
-    if source.table.part_starts.size > 1:
+    if scan.table.part_starts.size > 1:
         return
-    if (joined_file := joined_file_of(source.path)) is not None and is_joined(joined_file[0]):
+    if (joined_file := joined_file_of(scan.source.path)) is not None and is_joined(joined_file[0]):
         joined, n = joined_file
         sentence = f"This file is one of {n} parts of a scan: give {joined}, which has the frames of all"
-    elif others := other_parts(source.path):
+    elif others := other_parts(scan.source.path):
         sentence = f"This file is a part of a run, as {others[0]} is, and no file has the frames of all its parts"
-        sentence += f": {to_join(run_of(source.path.resolve().parent))}"
+        sentence += f": {to_join(run_of(scan.source.path.resolve().parent))}"
     else:
         return
     yield Finding("error", "parts", f"{sentence}. For this part alone, copy it out of the folder of its run.")
 
 
-SOURCE_RULES: tuple[Callable[[ScanSource], Iterator[Finding]], ...] = (
-    enough_views,
-    angles_known,
+@dataclass(frozen=True)
+class Row:
+    """A row of the table for a single finding: told in the sentence that its condition gives, unless that is empty."""
+
+    severity: Severity
+    rule: str
+    sentence: Callable[[ScanEvidence], object]
+
+    def __call__(self, scan: ScanEvidence) -> Iterator[Finding]:
+        if sentence := self.sentence(scan):
+            yield Finding(self.severity, self.rule, str(sentence))
+
+
+Rule = Callable[[ScanEvidence], Iterator[Finding]]
+RULES: tuple[Rule, ...] = (
+    Row("error", "views", lambda scan: (n := scan.table.views.size) < 2 and (
+        f"{n} projections: a reconstruction needs at least 2, a good one hundreds."
+    )),
+    Row("error", "angles", angles_unknown),
+    Row("warning", "angles", lambda scan: (where := scan.source.attributes.get("angles_reversed")) and (
+        f"The angles of {where} are taken in the reverse sense, as the vector of their axis is negative. "
+        f"--angles-path {where} takes them as they stand; the volume is then the mirror image of this one."
+    )),
     angles_spread,
     angles_shown,
     quantity_stated,
     references_present,
     numbers_wrapped,
-    darks_measured,
+    Row("info", CONSTANT_DARKS, darks_computed),
     exposures_agree,
-    one_energy,
+    Row("error", "energies", several_energies),
     light_one,
     pixels_measured,
-    pixels_as_labelled,
+    Row("warning", "pixels", lambda scan: (wrong := scan.source.attributes.get("pixels")) and (
+        f"The label of the pixels is wrong or missing: they are {wrong}."
+    )),
     views_scaled,
     axis_vertical,
     views_first,
     sinogram_told,
-    series_complete,
-    scale_known,
+    Row("warning", "missing-frames", lambda scan: (n := scan.source.attributes.get("missing_triggers")) and (
+        f"{n} triggers gave no frame; the file lists them."
+    )),
+    Row("warning", "missing-frames", lambda scan: (numbers := scan.source.attributes.get("missing_numbers")) and (
+        f"The series of files leaves out the numbers {numbers}."
+    )),
+    Row("info", "pixel-size", lambda scan: scan.source.pixel_size_mm is None and (
+        "No pixel size: lengths will be in pixels, densities per pixel."
+    )),
+    Row("error", "pixel-size", lambda scan: (size := scan.source.pixel_size_mm) is not None and not 0 < size < 10 and (
+        f"A pixel size of {size:g} mm cannot be."
+    )),
     pixels_square,
     stated_used,
     parts_joined,
-)
+    Row("warning", "frames-per-view", joined_views),
+    central_ray_taken,
+    scan_ended,
+    references_usable,
+    darks_beside_views,
+    frames_flagged,
+)  # fmt: skip
+"""All rules on a scan, in the order in which their findings are told by `validate`, `info` and the preparation."""
+BEFORE_VIEWS: tuple[Rule, ...] = (quantity_stated, references_present, numbers_wrapped, references_usable)
+"""Those that a running scan must meet before its views are corrected."""
+
+
+def findings_of(scan: ScanEvidence, rules: tuple[Rule, ...] = RULES) -> list[Finding]:
+    """What these rules find in a scan; of one that would take too long, that it was not asked."""
+    findings = list[Finding]()
+    for rule in rules:
+        try:
+            findings += rule(scan)
+        except TakesTooLongError as error:
+            findings.append(Finding("warning", "brief", str(error)))
+    return findings

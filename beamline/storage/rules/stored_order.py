@@ -7,8 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.storage.readers.base import ScanSource, read_known
+from beamline.storage.readers.base import read_known
 from beamline.storage.rules import Finding
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.pixels import SHAPES
 from recon.base.views import spread
 from recon.prep.unmeasured import with_borders_filled
@@ -20,12 +21,12 @@ _ON_A_SINE, _OFF_A_SINE, _OTHER_MASS = 0.9, 4.0, 4.0  # share of a change; times
 _HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
 
 
-def axis_vertical(source: ScanSource) -> Iterator[Finding]:
+def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
     """The rotation axis is parallel to the columns: each detector row then shows the same matter in every view."""
-    views = source.table.views_with_angles
-    if source.table.shifts is not None or views.size < _LEAST or min(source.shape) < _LEAST:
+    views = scan.table.views_with_angles
+    if scan.table.shifts is not None or views.size < _LEAST or min(scan.source.shape) < _LEAST:
         return
-    depths = _depths(source, spread(views, _TURNED))
+    depths = _depths(scan, spread(views, _TURNED))
     if not depths.size:
         return
     ratio = change_of_rows(depths)
@@ -34,7 +35,7 @@ def axis_vertical(source: ScanSource) -> Iterator[Finding]:
             "warning",
             "axis",
             f"From view to view the matter in a row changes {ratio:.3g} times as much as the matter in a column, as if "
-            f"the rotation axis were horizontal; it is expected along the columns. {_exchanged(source)}If it is "
+            f"the rotation axis were horizontal; it is expected along the columns. {_exchanged(scan)}If it is "
             "horizontal, say --horizontal-axis.",
         )
 
@@ -42,14 +43,17 @@ def axis_vertical(source: ScanSource) -> Iterator[Finding]:
 _EXCHANGE = (("angle", "theta"), ("dark", "data_dark"), ("flat", "data_white"))
 
 
-def _exchanged(source: ScanSource) -> str:
+def _exchanged(scan: ScanEvidence) -> str:
     """How rows and columns of stacks in HDF5 are exchanged, as a sentence; "" for other formats.
 
     MATLAB writes dimensions in reverse. A quarter turn would show the mirror image of these.
     """
-    data, dimensions = source.attributes.get("data"), str(source.attributes.get("dimensions", "frame,row,col"))
+    data, dimensions = (
+        scan.source.attributes.get("data"),
+        str(scan.source.attributes.get("dimensions", "frame,row,col")),
+    )
     others = ""
-    if source.format == "data_exchange":
+    if scan.source.format == "data_exchange":
         data, others = "exchange/data", "".join(f" --{name}s-path exchange/{at}" for name, at in _EXCHANGE)
     order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
     say = f"If rows and columns are exchanged, as MATLAB writes them, say --data-path {data}:{order}{others}. "
@@ -75,18 +79,18 @@ def change_of_rows(depths: NDArray[np.float64]) -> float:
     return of_rows / max(of_cols, rounding) if of_rows > rounding else 0.0
 
 
-def views_first(source: ScanSource) -> Iterator[Finding]:
+def views_first(scan: ScanEvidence) -> Iterator[Finding]:
     """If there are as many views as rows, the first dimension is that of the views, and the second that of the rows.
 
     In sinograms it is the other way round: of each image the rows are views, so that they have one mass, and the first
     moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do not.
     """
-    views = source.table.views
-    angles = source.table.angles[views]
-    if source.table.shifts is not None or not views.size == source.shape[0] >= _LEAST_SQUARE:
+    views = scan.table.views
+    angles = scan.table.angles[views]
+    if scan.table.shifts is not None or not views.size == scan.source.shape[0] >= _LEAST_SQUARE:
         return
     some = np.arange(views.size)[:: -(-views.size // SHAPES)]
-    depths = _depths(source, views[some]) if np.isfinite(angles).all() and source.shape[1] >= _LEAST else np.zeros(0)
+    depths = _depths(scan, views[some]) if np.isfinite(angles).all() and scan.source.shape[1] >= _LEAST else np.zeros(0)
     if len(depths) != some.size:
         return
     ends = max(1, depths.shape[2] // 16)
@@ -111,20 +115,20 @@ def views_first(source: ScanSource) -> Iterator[Finding]:
 SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and `recon` show
 
 
-def sinogram_told(source: ScanSource) -> Iterator[Finding]:
+def sinogram_told(scan: ScanEvidence) -> Iterator[Finding]:
     """Tell what is taken for the views of an array [view, col], and how to state another order."""
-    axes = str(source.attributes.get("dimensions", "")).split(",")
+    axes = str(scan.source.attributes.get("dimensions", "")).split(",")
     if sorted(axes) == ["col", "frame"]:
-        n = source.table.views.size
+        n = scan.table.views.size
         first = axes[0] == "frame"
         option = f"give --order {'col,view' if first else 'view,col'}"
-        if source.format == "data_exchange":
+        if scan.source.format == "data_exchange":
             option = f"set the attribute axes of /exchange/data to {'x:theta' if first else 'theta:x'}"
         yield Finding(
             "info",
             SINOGRAM,
-            f"The array has two dimensions: it is taken as one sinogram of {n} views and {source.shape[1]} columns. "
-            f"If they are the other way round, {option}.",
+            f"The array has two dimensions: it is taken as one sinogram of {n} views and {scan.source.shape[1]} "
+            f"columns. If they are the other way round, {option}.",
         )
 
 
@@ -136,22 +140,22 @@ def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> floa
     return 1 - float((rest**2).mean(axis=0).sum()) / change if change > 0 else 0.0
 
 
-def _depths(source: ScanSource, views: NDArray[np.int64]) -> NDArray[np.float64]:
+def _depths(scan: ScanEvidence, views: NDArray[np.int64]) -> NDArray[np.float64]:
     """Line integrals of some views [view, row, col], coarse, but for what all views share."""
-    block = max(1, min(max(source.shape) // 128, min(source.shape) // _LEAST))
-    rows, cols = (n // block for n in source.shape)
-    darks = source.table.darks[:1]
-    dark = read_known(source, darks)[0].astype(np.float64) if darks.size and source.quantity == "counts" else 0.0
+    block = max(1, min(max(scan.source.shape) // 128, min(scan.source.shape) // _LEAST))
+    rows, cols = (n // block for n in scan.source.shape)
+    darks = scan.table.darks[:1]
+    dark = read_known(scan.source, darks)[0].astype(np.float64) if darks.size and scan.in_counts else 0.0
     bits = []
     for view in views.tolist():
-        image = read_known(source, [view])[0].astype(np.float64)
-        if view in source.unreadable or not np.isfinite(image).all():
+        image = read_known(scan.source, [view])[0].astype(np.float64)
+        if view in scan.source.unreadable or not np.isfinite(image).all():
             continue
-        image = image if source.quantity == "line_integrals" else with_borders_filled(image) - dark
+        image = image if scan.source.quantity == "line_integrals" else with_borders_filled(image) - dark
         coarse = image[: rows * block, : cols * block].reshape(rows, block, cols, block).mean(axis=(1, 3))
         bits.append(coarse)
     depths = np.array(bits).reshape(-1, rows, cols)
-    if source.quantity == "line_integrals" or not len(depths):
+    if scan.source.quantity == "line_integrals" or not len(depths):
         return depths
     if not depths.max() > 0:  # neither counts nor transmission
         return depths[:0]

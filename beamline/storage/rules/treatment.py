@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +14,11 @@ from beamline.monitor.check import Level
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.storage.flag_legend import FlagBit, FrameFlags, counted
-from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules import Finding
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import Mask
 
+FLAGS = "flags"
 LARGEST = 0.5  # of the view: a flag with a larger region, or none, is of the whole view
 MARGIN = 0.25  # of the region's shorter side, on all sides
 
@@ -31,6 +32,7 @@ class Treatment:
         views, left_out, halved, masked: bool [frame of the file]: the views. Of these, those with an alarm, which are
             left out; those with a warning, which weigh half; those flagged in a part, where rays weigh less.
         jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
+        parts: regions of frames that are flagged only in some: the frame, the region, and whether it has an alarm.
     """
 
     flags: FrameFlags
@@ -39,6 +41,7 @@ class Treatment:
     halved: Mask
     masked: Mask
     jumps: NDArray[np.int64]
+    parts: Sequence[tuple[int, PixelBox, bool]] = ()
 
     @property
     def in_words(self) -> str:
@@ -65,18 +68,16 @@ def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Trea
     flags = flags.without(MotionCheck.bit)
     if jumped.size:  # what views from the other side show of the jump goes with the views beyond it
         flags = flags.without(OppositeCheck.bit)
-    local = flagged_in_part(flags, shape)
+    boxes = [
+        (frame, box, bool(flags.bits[frame] >> entry.alarm_bit & 1))
+        for i, entry in enumerate(flags.legend)
+        for frame, box in boxes_of(flags, i, entry, shape)
+    ]
+    whole = {frame for frame, box, _ in boxes if box is None}
+    local = flags.flagged & ~np.isin(np.arange(flags.bits.size), list(whole))
+    parts = [(frame, box, alarm) for frame, box, alarm in boxes if box is not None and frame not in whole]
     left_out, halved = (views & some & ~local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
-    return Treatment(flags, views, left_out, halved, views & local, jumped)
-
-
-def flagged_in_part(flags: FrameFlags, shape: tuple[int, int]) -> Mask:
-    """Whether each frame [frame] is flagged only in some regions."""
-    whole = np.zeros(flags.bits.size, np.bool_)
-    for i, entry in enumerate(flags.legend):
-        for frame, box in boxes_of(flags, i, entry, shape):
-            whole[frame] |= box is None
-    return flags.flagged & ~whole
+    return Treatment(flags, views, left_out, halved, views & local, jumped, parts)
 
 
 def boxes_of(
@@ -114,19 +115,15 @@ FEWEST_VIEWS = 10
 """Views without an alarm that a volume takes at least, where some have one: so few are a sketch of the sample."""
 
 
-def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iterator[Finding]:
-    """Number of flagged frames by check and level, and the rows of those with an alarm.
-
-    Args:
-        judged: flags that count in place of the file's.
-    """
-    flags = source.table.flags if judged is None else judged
+def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:
+    """Number of flagged frames by check and level, and the rows of those with an alarm."""
+    flags = scan.flags
     if flags is None or not flags.flagged.any():
         return
-    rows, again = np.flatnonzero(flags.alarmed), source.table.replaced
+    rows, again = np.flatnonzero(flags.alarmed), scan.table.replaced
     message = f"The monitor flagged {flags.flagged.sum()} of {flags.bits.size} frames: {counted(flags.counts())}."
     if not rows.size:
-        yield Finding("info", "flags", message)
+        yield Finding("info", FLAGS, message)
         return
     message += f" Frames with an alarm: {spans(rows.tolist())}."
     if again.size:
@@ -136,18 +133,18 @@ def frames_flagged(source: ScanSource, judged: FrameFlags | None = None) -> Iter
         )
         rows = np.setdiff1d(rows, again)
         if not rows.size:
-            yield Finding("info", "flags", f"{message} No other frame has an alarm.")
+            yield Finding("info", FLAGS, f"{message} No other frame has an alarm.")
             return
         message += f" Frames with an alarm beside these: {spans(rows.tolist())}."
-    treated = treatment_of(flags, source.table.are_views, source.shape)
+    treated = treatment_of(flags, scan.table.are_views, scan.source.shape)
     n, lost = int(treated.views.sum()), int(treated.left_out.sum())
     if lost and n - lost < FEWEST_VIEWS:
         message += (
             f" {n - lost} of {n} views are left, {FEWEST_VIEWS} are needed: repeat the scan. "
             "`beamline recon --flags ignore` takes all views, flagged ones too."
         )
-        yield Finding("error", "flags", message)
+        yield Finding("error", FLAGS, message)
         return
     if treated.in_words:
         message += f" A reconstruction (--flags use): {treated.in_words}"
-    yield Finding("warning", "flags", message)
+    yield Finding("warning", FLAGS, message)

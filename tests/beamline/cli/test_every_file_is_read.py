@@ -143,7 +143,7 @@ OTHERS: dict[str, tuple[str, ...]] = {
     "sheet.png": ("monitor", "simulated.h5", "--sheet"),
     "histogram.png": ("info", "simulated.h5", "--statistics", "-o"),
     "checkpoint.h5": ("recon", "simulated.h5", "-m", "r2", "--steps", "9", "-o", "v.h5", "--no-report", "--checkpoint"),
-    "sweep.png": ("sweep", "simulated.h5", "axis=14:17:1", "-o"),
+    "sweep": ("sweep", "simulated.h5", "axis=14:17:1", "-o"),
     "study": ("study", "fixed-views", "simulated.h5", "-o"),
     "tradeoff": ("tradeoff", "simulated.h5", "-o"),
     "batch": ("batch", "simulated.h5", "-o"),
@@ -155,7 +155,7 @@ def test_no_output_takes_the_place_of_what_is_there(written: Path, tmp_path: Pat
     """Of a file, a folder, or a link, as one to a disk that is not mounted."""
     command = {**SCANS, **FLOATS, **GREYS, **LABELS, **OTHERS}[name]
     there = tmp_path / name
-    if name in ("study", "tradeoff", "batch"):
+    if name in ("study", "tradeoff", "sweep", "batch"):
         there.mkdir()
         mine = there / "mine"
     else:

@@ -15,19 +15,19 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid, Volume
 from recon.judgement import judge
 from recon.voxels.direct import direct
-from recon.voxels.projector import Projector
+from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.resolution import ViewResolution
 from tests.beamline.array_source import ArraySource
 from tests.beamline.cli.small_scan import SCAN, beamline, succeeds
-from tests.beamline.prepared_views import prepared_views
 
-SWEEP = "beamline.features.sweeps.sweep"
+SWEEP = "beamline.features.trials.sweep"
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path) -> None:
     """The same volume and the same views: one figure, and one label."""
     sweep, trials = pytest.importorskip(SWEEP), pytest.importorskip("beamline.features.trials.run_trial")
+    trial = pytest.importorskip("beamline.features.trials.trial").MethodTrial("method", "fbp", 10)
     source = ArraySource(SCAN.line_integrals().astype(np.float32), [0] * len(SCAN.angles), SCAN.angles)
     source.quantity = "line_integrals"
     prepared = prepare_projections(source, Selection(views="every:3", axis_col=20.7), lambda _: None)
@@ -36,14 +36,12 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     volume = Volume(direct(prepared.projections.data, prepared.geometry, grid, "hann"), grid)
     by_recon = judge(volume, prepared.views, held_out=prepared.views_held_out).figures["residual_held_out"]
     assert prepared.held_out is not None and prepared.held_out_ids is not None
-    projector = Projector(prepared.held_out[1], grid)
-    one = sweep.SweptSlice(
-        {"a": "1"}, volume.data[0], 0.0, prepared, projector.forward(volume.data), projector.resolution
-    )
-    scores = sweep.scores_of([one])
+    projector, ids = Projector(prepared.held_out[1], grid), prepared.held_out_ids
+    model, data = (projection_lines(each) for each in (projector.forward(volume.data), prepared.held_out[0]))
+    scores = sweep.scores_of({"a 1": sweep.UnseenViews(ids, data, model, projector.resolution, "")})
     assert scores is not None
-    by_tradeoff, _ = trials.measured("fbp", volume.data, trials.TrialData(prepared, None), grid)
-    assert scores.shares[0] == pytest.approx(by_recon, rel=1e-5)
+    by_tradeoff, _ = trials.TrialData(prepared).measured(trial, volume)
+    assert sweep.shares_of(scores[0])[0] == pytest.approx(by_recon, rel=1e-5)
     assert by_tradeoff["residual_held_out"] == pytest.approx(by_recon, rel=1e-5)
     swept = beamline("sweep", "scan.h5", "filter=ram-lak,hann", "--axis", "20.7")
     assert METRICS["residual_held_out"].label in swept.stdout
@@ -66,16 +64,15 @@ def test_times_of_the_terminal_the_page_and_the_events(folder: Path) -> None:
 
 def test_a_sweep_whose_residual_hardly_changes_names_no_value() -> None:
     sweep = pytest.importorskip(SWEEP)
-    image, views_at = np.zeros((8, 8), np.float32), Geometry.parallel(np.arange(4.0), (2, 8))
-    lines = np.ones((4, 2, 8), np.float32)
-    views = prepared_views(lines, views_at, held_out=(lines, views_at), held_out_ids=np.arange(4))
+    views_at = Geometry.parallel(np.arange(4.0), (2, 8))
     even = ViewResolution.of(views_at, Grid.matching(views_at))
 
     def leaving(share: float) -> object:
-        return sweep.SweptSlice(
-            {"axis": str(share)}, image, 0.0, views, np.full((4, 2, 8), 1 + share, np.float32), even
-        )
+        data, model = (np.full((4, 8, 2), value, np.float32) for value in (1, 1 + share))
+        return sweep.UnseenViews(np.arange(4), data, model, even, "")
 
-    flat, clear = (sweep.scores_of([leaving(0.1), leaving(worse)], direct=True) for worse in (0.103, 0.12))
-    assert flat is not None and flat.best is None and not any(flat.verdicts)
-    assert clear is not None and clear.best == 0
+    flat, clear = (
+        sweep.scores_of({"axis 1": leaving(0.1), "axis 2": leaving(worse)}, direct=True) for worse in (0.103, 0.12)
+    )
+    assert flat is not None and flat[0].verdicts == ["", ""]
+    assert clear is not None and clear[0].verdicts == ["best", ""]

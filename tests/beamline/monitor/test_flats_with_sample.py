@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from beamline.storage.rules import Finding
-from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.light import references_usable
 from tests.beamline.array_source import ArraySource
 
 ROWS, COLS, VIEWS, FLATS, LIGHT = 16, 96, 32, 4, 3e4
@@ -53,7 +54,7 @@ def scan(balls: Balls, in_flats: NDArray[np.float64], drift: float = 0.0, seed: 
 
 
 def told(source: ArraySource) -> list[Finding]:
-    return list(references_usable(source))
+    return list(references_usable(ScanEvidence(source)))
 
 
 @pytest.mark.parametrize(

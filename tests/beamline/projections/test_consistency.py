@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from beamline.projections.consistency import warn_of_inconsistency
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.selection import Selection
+from beamline.projections.selection import ScanSelection, Selection
 from recon.base.geometry import Geometry
 from tests.beamline.array_source import ArraySource
 from tests.beamline.prepared_views import prepare
@@ -35,7 +36,8 @@ def told(views: np.ndarray, axis_col: float = AXIS, angles: np.ndarray = ANGLES)
     projections = replace(scan.projections, data=views.astype(np.float32))
     geometry = Geometry.parallel(angles, VIEWS.shape[1:], axis_col=axis_col)
     scan = replace(scan, projections=projections, geometry=geometry)
-    warn_of_inconsistency(scan, Selection(axis_col=axis_col), sentences.append)
+    whole = ScanSelection(asked=Selection(), shape=VIEWS.shape[1:], path=Path("scan.h5"), axis_col=axis_col)
+    warn_of_inconsistency(scan, whole, sentences.append)
     return sentences
 
 

@@ -14,7 +14,9 @@ from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
-from beamline.storage.rules.references import references_usable
+from beamline.projections.views import evidence_of
+from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.light import references_usable
 from recon.prep.correct import merge_and_empty
 from tests.beamline.array_source import ArraySource, counted, scan_of
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
@@ -25,7 +27,7 @@ PLAIN = Selection(steps=(Air("none"),))
 
 
 def correction_of(source: Any, selection: Selection, warn: Callable[[str], None] = pytest.fail) -> ScanCorrection:
-    return ScanCorrection(source, selection, warn)
+    return ScanCorrection(evidence_of(source, selection), selection.of(source), warn)
 
 
 @pytest.mark.parametrize("air", ["auto", "none", "3,3"])
@@ -87,10 +89,10 @@ def test_dynamic_flats_of_a_beam_that_moves(rng: np.random.Generator) -> None:
     errors = []
     for way in ("groups", "dynamic"):
         correction = correction_of(source, Selection(steps=(Preparation(flat_fields=way),)))
-        assert bool(correction.done["flats"].sentence) is (way == "dynamic")
+        assert bool(correction.plan.done["flats"].sentence) is (way == "dynamic")
         errors.append(float(np.std(correction.at_once(np.arange(13, 58)).data - SCAN.line_integrals())))
     assert errors[1] < 0.3 * errors[0]
-    assert "components of their changes" in correction.done["flats"].sentence
+    assert "components of their changes" in correction.plan.done["flats"].sentence
     few = scan_of(data[:1], data[1:4], data[13:], SCAN.angles, np.float32)
     with pytest.raises(ConfigError, match="--flat-fields"):
         correction_of(few, Selection(steps=(Preparation(flat_fields="dynamic"),)), lambda _: None)
@@ -111,7 +113,10 @@ def test_a_beam_that_decays_is_corrected_by_the_ring_current() -> None:
         correction = correction_of(source, selection)
         off.append(float(np.abs(correction.at_once(np.arange(3, 48)).data - SCAN.line_integrals()).max()))
     assert off[0] > 0.5 and off[1] < 0.01
-    assert correction.done["flats"].sentence == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
+    assert (
+        correction.plan.done["flats"].sentence
+        == "Ring current of the views: 0.857 to 1.143 times its median; corrected."
+    )
     current[2] = np.nan
     source.state(currents=current)
     with pytest.raises(ConfigError, match="views or flats"):
@@ -145,7 +150,7 @@ def test_darks_are_dealt_by_exposure(dark: list[float], flat: float) -> None:
     batches = correction.in_batches(frames, np.empty((45, 4, 40), np.float32), 7, lambda n, of: None)
     for found in (correction.at_once(frames), batches):
         np.testing.assert_allclose(found.data, SCAN.line_integrals(), atol=3e-3)
-    assert not list(references_usable(source))
+    assert not list(references_usable(ScanEvidence(source)))
 
 
 @pytest.mark.parametrize("flat", [0.1, 0.3])
@@ -155,8 +160,8 @@ def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
     correction = correction_of(source, PLAIN)
     found = correction.at_once(np.flatnonzero(source.table.kinds == 0)).data
     np.testing.assert_allclose(found, SCAN.line_integrals(), atol=2e-3)
-    assert correction.done["flats"].sentence.startswith("Exposures of the views: 0.1")
-    assert not list(references_usable(source))
+    assert correction.plan.done["flats"].sentence.startswith("Exposures of the views: 0.1")
+    assert not list(references_usable(ScanEvidence(source)))
 
 
 def test_spots_are_sought_beside_views_with_the_sample_at_the_same_place(rng: np.random.Generator) -> None:

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import read_references
 from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
-from beamline.storage.rules.references import ReferenceGroups, groups_of
-from drivers.base.frame import FrameKind
+from beamline.projections.views import evidence_of
 from tests.beamline.array_source import ArraySource
 
 
@@ -56,8 +56,8 @@ def test_flats_are_grouped_by_the_views_between_them() -> None:
     keys = [2, 1, 1, 0, 0, 0, 1, 3, 1, 0, 2, 1]
     data = np.arange(12, dtype=np.uint16)[:, None, None] * np.ones((1, 2, 2), np.uint16)
     source = ArraySource(data, keys, np.zeros(12))
-    darks, flats = (groups_of(source, kind) for kind in (FrameKind.DARK, FrameKind.FLAT))
-    references = read_references(source, ReferenceGroups(darks, flats, ()), slice(0, 2), Selection())
+    accepting = Selection(steps=(Preparation(references="accept"),))
+    references = read_references(evidence_of(source, accepting), slice(0, 2), accepting.of(source))
     assert [(position, float(flat[0, 0])) for position, flat in references.flats] == [
         (1.5, 1.5),
         (7.0, 7.0),

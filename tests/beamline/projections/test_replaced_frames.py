@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from beamline.core.errors import DataError
-from beamline.storage.rules.references import reference_groups
+from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
 from tests.beamline.projections.replaced import BEAM, VIEWS, Blocks, decibels, line_integrals
 from tests.slow_cases import others_slow
@@ -136,4 +136,4 @@ def test_a_beam_that_drifts_is_no_sample_in_the_flats(scale: float, drift: float
     light = 1 + drift * (np.linspace(0, 1, VIEWS)[:, None, None] * ramp - 0.3)
     blocks.of(VIEW)[0][:] = 100 + (blocks.of(VIEW)[0] - 100) * light
     blocks.of(FLAT)[1][:] = 100 + (blocks.of(FLAT)[1] - 100) * light[-1]
-    assert not any(finding.frames for finding in reference_groups(blocks.source()).findings)
+    assert not any(finding.frames for finding in ScanEvidence(blocks.source()).findings)

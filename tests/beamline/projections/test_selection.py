@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from beamline.core.errors import ConfigError
 from beamline.projections.prepare import prepare_projections
-from beamline.projections.selection import Selection, geometry_of, unbinned
+from beamline.projections.selection import Selection, unbinned
 from beamline.storage.readers.open import open_scan
 from recon.base.geometry import Geometry
 from tests.beamline.array_source import scan_of
@@ -45,8 +45,8 @@ def test_selections_that_do_not_fit(tmp_path: Path, selection: Selection, said: 
 def test_the_central_ray_meets_the_row_that_is_given_whatever_rows_are_read() -> None:
     source: Any = scan_of(np.ones((1, 8, 6)), np.ones((1, 8, 6)), np.ones((3, 8, 6)), np.arange(3.0))
     cone = Selection(cone=(20, 40), pixel_size_mm=0.2, central_row=9.0)  # off the detector
-    assert geometry_of(source, cone, 2.5, np.arange(3.0)).axis_row == 9
+    assert cone.of(source).geometry(2.5, np.arange(3.0)).axis_row == 9
     half = replace(cone, rows=(2, 8), binning=2)
-    assert geometry_of(source, half, 2.5, np.arange(3.0)).axis_row == (9 - 2 - 0.5) / 2
+    assert half.of(source).geometry(2.5, np.arange(3.0)).axis_row == (9 - 2 - 0.5) / 2
     with pytest.raises(ConfigError, match="--central-row is for a cone beam; array is a parallel one"):
-        geometry_of(source, replace(cone, cone=None), 2.5, np.arange(3.0))
+        replace(cone, cone=None).of(source).geometry(2.5, np.arange(3.0))

@@ -83,6 +83,7 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
     looks, told = list[int](), list[str]()
     warn = Warnings(lambda event: told.append(event.data["message"]), SystemClock())
     correction: Any = None
+    selected: Any = Selection()
     source: Any = SimpleNamespace(
         table=SimpleNamespace(angles=np.radians(np.arange(0, 360, 1.8))), axis_col=None, cone=None
     )
@@ -93,8 +94,7 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
         return 20.7, AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), sure, "ends of half a turn")
 
     monkeypatch.setattr(followed_views, "locate_axis", locate)
-    monkeypatch.setattr(followed_views, "cone_of", lambda source, selection: None)
-    search = followed_views.AxisSearch(source, Selection(), warn)
+    search = followed_views.AxisSearch(source, selected, warn)
     for n in range(1, 101):
         search.look(correction, np.arange(n), False)
         assert (search.col is None) == (n < looks[-1] if looks and looks[-1] > 95 else True)

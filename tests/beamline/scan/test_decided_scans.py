@@ -27,6 +27,7 @@ from beamline.scan.resume import NothingMissing, open_for_resume
 from beamline.scan.run import run_scan
 from beamline.scan.runs import cells, describe
 from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import scan_ended
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import ScanInfo
@@ -89,7 +90,7 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
     assert (run.frames, run.planned, run.state) == (16, 19, "done") and run.ended.startswith(said)
     assert "16 of 19" in cells(run)
     with open_scan(ran.folder / "scan.h5") as source:
-        assert [(found.severity, found.message) for found in scan_ended(source)] == [("info", run.ended)]
+        assert [(found.severity, found.message) for found in scan_ended(ScanEvidence(source))] == [("info", run.ended)]
         facts = facts_of(source)
         assert facts.frames == "16/19" and run.ended in facts.remarks and source.attributes["ended"] == run.ended
     assert run.ended.endswith("1 dB less is accepted. 3 planned frames were not taken.")

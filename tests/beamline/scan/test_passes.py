@@ -31,6 +31,7 @@ from beamline.scan.supervision import Supervision
 from beamline.storage.interrupted import next_step
 from beamline.storage.readers.open import open_scan
 from beamline.storage.recorded_frames import decisions_in, pass_ends_in
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.writers import layout
 from beamline.storage.writers.rows import ending_in
 from drivers.base.frame import Frame, FrameKind
@@ -391,7 +392,7 @@ def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
         with open_scan(file) as source:
             assert source.table.pass_ends.tolist() == [13, 21, 25, 33, 41]
             assert [values["choice"] for values in source.decisions] == chooser.answers
-            assert usable_views(source, use_flags=True).frames.size == 32
+            assert usable_views(ScanEvidence(source), use_flags=True).frames.size == 32
             assert judged_flags(source).flagged.sum() == 0
     out = tmp_path / "volume.h5"
     made = CliRunner().invoke(main, ["recon", str(path), "-m", "fbp", "--axis", "5.5", "-o", str(out), "--no-report"])

@@ -24,7 +24,7 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.views import checked_views
+from beamline.projections.views import checked_views, evidence_of
 from beamline.scan import control
 from beamline.scan.control import State, Verb, running, tell
 from beamline.scan.resume import ResumableRun, open_for_resume, recover_run
@@ -168,7 +168,8 @@ def _assert_told_of_parts(run: Path) -> None:
         line = f"This file is one of 2 parts of a scan: give {run / 'joined.h5'}, which has the frames of all."
         assert sum(finding.startswith(line) for finding in describe(part)["findings"]) == 1
         with open_scan(part) as source, pytest.raises(DataError, match=re.escape(line)):
-            checked_views(source, Selection(steps=(Preparation(references="accept"),)), lambda _: None)
+            accepting = Selection(steps=(Preparation(references="accept"),))
+            checked_views(evidence_of(source, accepting), accepting.of(source), lambda _: None)
         assert whole_scan(part) == run / "joined.h5" == watched(part).scan
     with closing(Reader(watched(run))) as reader:
         assert reader.state()["frames"] == open_scan(run / "joined.h5").table.kinds.size

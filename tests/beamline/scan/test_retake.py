@@ -16,6 +16,7 @@ from beamline.projections.replay import judged_flags
 from beamline.projections.usable_views import usable_views
 from beamline.scan.resume import open_for_resume
 from beamline.storage.readers.open import open_scan
+from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran
@@ -52,7 +53,7 @@ def test_each_view_with_an_alarm_is_taken_again_at_its_angle(mode: str, repeats:
                 assert frame.angle == pytest.approx(first.angle, abs=COUNT)
                 stood = decode(frame.counts)[0] * COUNT
                 assert np.degrees(stood - frame.angle) == pytest.approx(MIDDLE[mode], abs=0.01)
-            views = usable_views(source, use_flags=True).frames
+            views = usable_views(ScanEvidence(source), use_flags=True).frames
             left = repeats - {frame.replaces for frame in again}
             assert views.size == N - len(left)
             steps = np.degrees(source.table.angles[views]) / 11.25
@@ -139,7 +140,7 @@ def test_a_view_that_gave_no_frame_is_taken_again_under_its_trigger(tmp_path: Pa
         again = FIRST + N - 1
         assert source.table.kinds[again] == FrameKind.PROJECTION
         assert np.degrees(source.table.angles[again]) == pytest.approx(3 * 11.25, abs=0.01)
-        views = usable_views(source, use_flags=True).frames
+        views = usable_views(ScanEvidence(source), use_flags=True).frames
         assert views.size == N and again in views
     with h5py.File(ran.result.path) as file:
         assert (file["entry/frame_log/trigger"][again], file["entry/frame_log/replaces"][again]) == (3, -1)

@@ -20,6 +20,7 @@ from beamline.monitor.digest import digest
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.recover import recover
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import scan_ended
 from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers.nxtomo import NXtomoWriter
@@ -100,7 +101,9 @@ def test_a_copy_states_how_its_scan_ended(scan: Callable[[str], Path], tmp_path:
     COPIES[command](original, out)
     with open_scan(out) as source:
         assert (source.ending, source.finished) == (ENDINGS[end], True)
-        warned = [found.message for found in scan_ended(source)]  # as validate, recon and its volume say it
+        warned = [
+            found.message for found in scan_ended(ScanEvidence(source))
+        ]  # as validate, recon and its volume say it
     assert (ENDINGS[end].reason in "".join(warned)) and bool(warned) == (end != "complete")
     assert all(f"with 4 of {VIEWS} views" in message for message in warned)
     if end != "failed":  # which states the most

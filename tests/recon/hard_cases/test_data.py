@@ -15,6 +15,7 @@ from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
 from recon.base.kernel import Truncation
 from recon.base.method import DataUse, Reconstruction
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.prep.correct import References, correct
 from recon.reconstruction import reconstruct
@@ -150,7 +151,7 @@ def test_one_view_is_refused_by_name_but_no_step_breaks_on_it(clean: F32) -> Non
     one = VIEWS.select([3])
     with pytest.raises(ValueError, match="determine a volume"):
         reconstruct(clean[3:4], one)
-    problem = fit.problem_of(clean[3:4], one, GRID, 0.05, SHORT)
+    problem = fit.problem_of(Views(clean[3:4], one), GRID, 0.05, SHORT)
     state = run_steps(fit.init(a_few(), 0), problem, SHORT, 200)
     assert all(np.isfinite(values).all() for values in state.parameters.values())
     assert float(state.residual) < 0.5
@@ -180,7 +181,7 @@ def test_order_and_whole_turns_of_the_angles_do_not_matter(order: list[int], tur
 def test_detectors_of_one_row_or_one_column(shape: tuple[int, int]) -> None:
     views = Geometry.parallel(VIEWS.angles, shape, axis_col=(shape[1] - 1) / 2)
     data = spheres.projections(views)
-    problem = fit.problem_of(data, views, Grid.matching(views), 0.05, SHORT)
+    problem = fit.problem_of(Views(data, views), Grid.matching(views), 0.05, SHORT)
     state = run_steps(fit.init(a_few(), 0), problem, SHORT, 60)
     assert all(np.isfinite(values).all() for values in state.parameters.values())
     if shape == (1, 48):
@@ -190,7 +191,7 @@ def test_detectors_of_one_row_or_one_column(shape: tuple[int, int]) -> None:
 
 def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
     flat = Grid((3, 48, 48), 1.0, slice_pitch=4.0)
-    problem = fit.problem_of(clean, VIEWS, flat, 0.05, SHORT)
+    problem = fit.problem_of(Views(clean, VIEWS), flat, 0.05, SHORT)
     state = fit.init(a_few(), 0)
     before = fit.misfit_of(state, problem, SHORT)
     run_steps(state, problem, SHORT, 100)

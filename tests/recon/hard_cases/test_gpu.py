@@ -11,6 +11,7 @@ import torch
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import RayModel, Truncation
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.kernels.cpu.footprints import KV, K, W
 from recon.kernels.cpu.losses import L2, POISSON, DataTerm
@@ -154,7 +155,7 @@ def test_detectors_of_one_row_or_column_with_a_pixel_missing_are_the_cpus(
     states = []
     for device in ("cpu", "cuda"):
         backend = backend_for(device)
-        problem = fit.problem_of(data, views, flat, 0.7, settings, backend)
+        problem = fit.problem_of(Views(data, views), flat, 0.7, settings, backend)
         state = run_steps(fit.init(ON.some((1.0, 1.4, 0.8), 4), 3, 1.0, backend), problem, settings, 1)
         states.append({name: backend.numpy(values) for name, values in state.parameters.items()})
     for name, expected in states[0].items():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
@@ -39,7 +40,7 @@ def test_steps_without_drift(steps: int, loss: float) -> None:
     start, data = _start_and_data()
     # A lower last rate than by default, for which the bounds below were measured: the loss falls as far as it lets.
     settings = FitSettings(policy=None, tv_weight=0.0, pace=20.0, decay=0.03)
-    problem = fit.problem_of(data, VIEWS, Grid.matching(VIEWS), 0.7, settings)
+    problem = fit.problem_of(Views(data, VIEWS), Grid.matching(VIEWS), 0.7, settings)
     state = fit.init(start, 0)
     losses: list[float] = []
 

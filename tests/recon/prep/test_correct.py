@@ -14,13 +14,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from recon.prep.correct import (
-    Correction,
     CorrectionSettings,
+    Plan,
     Projections,
     References,
+    apply,
     correct,
     merge_and_empty,
-    provisional,
+    survey,
 )
 from recon.prep.references import air_columns, dead_pixels, edge_profiles
 
@@ -291,16 +292,19 @@ def in_batches(
     counts: NDArray[np.generic], references: References, options: CorrectionSettings, ends: list[int]
 ) -> Projections:
     """All views surveyed, then corrected in batches that end at `ends`; the last one ends with the scan."""
-    correction, at = Correction(references, options), positions(counts)
+    plan, at = survey(references, options), positions(counts)
     for view in range(len(counts)):
-        correction.survey(correction.transmission(counts[view : view + 1], at[view : view + 1]))
+        ids = np.array([view])
+        plan = plan.surveyed(plan.transmission(counts[view : view + 1], at[view : view + 1], ids))
+    following: Plan = replace(plan, settings=replace(options, air=plan.air_columns))  # whichever views follow
     parts = []
     for first, end in zip([0, *ends], [*ends, len(counts)], strict=True):
         batch = slice(first, end)
-        views = correction.transmission(counts[batch], at[batch], np.arange(first, end))
-        parts.append(correction.line_integrals(views, last=end == len(counts)))
-        provisional(correction)  # which changes nothing
-    assert not correction.spots.waiting and provisional(correction) is None
+        lines, following = apply(counts[batch], at[batch], following, np.arange(first, end), last=end == len(counts))
+        parts.append(lines)
+        if following.spots.waiting is not None:
+            following.line_integrals(None)  # which changes nothing
+    assert following.spots.waiting is None
     return merge_and_empty(parts)
 
 
@@ -334,17 +338,28 @@ def test_a_scan_may_end_after_its_last_view_was_fed(rng: np.random.Generator, ai
     """Nothing is left to feed, and the newest view waits: `line_integrals(None)` gives it out."""
     counts, references = beer_lambert(sphere(5), rng, noise=0.01)
     options = CorrectionSettings(air=air)  # type: ignore[arg-type]
-    correction = Correction(references, options)
-    views = correction.transmission(counts, positions(counts))
-    correction.survey(views)
-    parts = [correction.line_integrals(views, last=False)]
-    early = provisional(correction)
-    parts.append(correction.line_integrals(None))
-    assert early is not None
+    plan = survey(references, options)
+    lines, following = apply(counts, positions(counts), plan, np.arange(5), last=False)
+    early, _ = following.line_integrals(None)
+    parts = [lines, following.line_integrals(None)[0]]
     np.testing.assert_array_equal(early.data, parts[1].data)
     assert [part.view_ids.tolist() for part in parts] == [[0, 1, 2, 3], [4]]
     whole = correct(counts, positions(counts), references, options)
     np.testing.assert_array_equal(merge_and_empty(parts).data, whole.data)
+
+
+def test_apply_changes_neither_its_frames_nor_its_plan(rng: np.random.Generator) -> None:
+    """What was corrected before, and in which order, leaves no trace: a plan is a value."""
+    counts, references = beer_lambert(sphere(5), rng, noise=0.01)
+    counts[2, 4, 7] += 60_000
+    before, at, plan = counts.copy(), positions(counts), survey(references)
+    first, after = apply(counts, at, plan, np.arange(5))
+    apply(counts[::-1], at[::-1], plan, np.arange(5)[::-1], last=False)
+    again, _ = apply(counts, at, plan, np.arange(5))
+    np.testing.assert_array_equal(counts, before)
+    np.testing.assert_array_equal(first.data, again.data)
+    assert first.spots_left == again.spots_left and first.replaced == again.replaced > 0
+    assert plan.air_columns == (0, 0) != after.air_columns == first.air_columns
 
 
 def test_bad_input_is_refused_with_its_values() -> None:

@@ -31,12 +31,11 @@ def filtered(views: F32, ends: tuple[int, ...] = (), threshold: float = 8.0) -> 
     spots, parts = SpotFilter(threshold, lambda image: np.sqrt(np.maximum(image, 0))), []
     for first, end in zip((0, *ends), (*ends, len(views)), strict=True):
         ids = np.arange(first, end)
-        parts.append(
-            spots.feed(
-                Transmission(views[first:end].copy(), ids, np.zeros(ids.size, int), np.ones(ids.size, np.float32)),
-                end == len(views),
-            )
+        part, spots = spots.feed(
+            Transmission(views[first:end].copy(), ids, np.zeros(ids.size, int), np.ones(ids.size, np.float32)),
+            end == len(views),
         )
+        parts.append(part)
     whole = parts[0]
     for part in parts[1:]:
         whole = whole.and_then(part)
@@ -110,8 +109,8 @@ def test_spots_that_are_too_large_are_counted(size: int, left: int) -> None:
     views, spots = light(), SpotFilter(8.0, lambda image: np.sqrt(np.maximum(image, 0)))
     views[5, 8 : 8 + size, 20 : 20 + size] += 1.5
     ids = np.arange(VIEWS)
-    spots.feed(Transmission(views, ids, np.zeros(VIEWS, int), np.ones(VIEWS, np.float32)))
-    assert spots.left == left
+    _, after = spots.feed(Transmission(views, ids, np.zeros(VIEWS, int), np.ones(VIEWS, np.float32)))
+    assert after.left == left and spots.left == 0
 
 
 def test_a_bright_pixel_that_may_be_a_rim_of_few_views_is_no_large_spot() -> None:
@@ -120,9 +119,9 @@ def test_a_bright_pixel_that_may_be_a_rim_of_few_views_is_no_large_spot() -> Non
     views[5, 12, 30] = 1.5
     views[8, 12, 30] = 1.5
     ids = np.arange(VIEWS)
-    found = spots.feed(Transmission(views, ids, np.zeros(VIEWS, int), np.ones(VIEWS, np.float32)))
+    found, after = spots.feed(Transmission(views, ids, np.zeros(VIEWS, int), np.ones(VIEWS, np.float32)))
     assert np.flatnonzero(found.repaired).tolist() == [8]
-    assert spots.left == 0
+    assert after.left == 0
 
 
 def test_neighbours_of_interlaced_views_are_those_by_angle() -> None:
@@ -131,7 +130,7 @@ def test_neighbours_of_interlaced_views_are_those_by_angle() -> None:
     passes = np.concatenate([np.arange(first, 90, 9) for first in range(9)])
     root: Callable[[F32], F32] = lambda image: np.sqrt(np.maximum(image, 0))  # noqa: E731
     taken = Transmission(views[passes], passes, np.zeros(90, int), np.ones(90, np.float32))
-    found = SpotFilter(8.0, root).feed(taken, order=np.argsort(passes))
+    found, _ = SpotFilter(8.0, root).feed(taken, order=np.argsort(passes))
     np.testing.assert_array_equal(found.data[np.argsort(passes)], filtered(views).data)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from recon.base.arrays import Mask
-from recon.prep.correct import Correction, CorrectionSettings, References
+from recon.prep.correct import CorrectionSettings, Plan, References, apply, survey
 from recon.prep.unmeasured import foreign_rows, runs_of, unmeasured, with_borders_filled, with_rim
 
 SHAPE, VIEWS = (20, 64), 32
@@ -114,16 +114,13 @@ def test_batches_and_all_at_once_agree_to_the_bit() -> None:
     dark, flat = np.full(SHAPE, 100, np.float32), np.full(SHAPE, 1e4 + 100, np.float32)
     counts, at = light * 1e4 + 100, np.arange(VIEWS, dtype=float)
 
-    def correction() -> Correction:
-        return Correction(References(dark, ((0.0, flat),)), CorrectionSettings(air="none"), foreign=np.ones(20, bool))
-
-    whole = correction()
-    all_of_them = whole.line_integrals(whole.transmission(counts, at))
-    parts, some = [], correction()
+    plan: Plan = survey(References(dark, ((0.0, flat),)), CorrectionSettings(air="none"), foreign=np.ones(20, bool))
+    all_of_them, _ = apply(counts, at, plan, np.arange(VIEWS))
+    parts = []
     for first in range(0, VIEWS, 5):
         part = slice(first, first + 5)
-        views = some.transmission(counts[part], at[part], np.arange(VIEWS)[part])
-        parts.append(some.line_integrals(views, last=part.stop >= VIEWS))
+        lines, plan = apply(counts[part], at[part], plan, np.arange(VIEWS)[part], last=part.stop >= VIEWS)
+        parts.append(lines)
     np.testing.assert_array_equal(np.concatenate([part.data for part in parts]), all_of_them.data)
     np.testing.assert_array_equal(np.concatenate([part.unmeasured for part in parts]), all_of_them.unmeasured)
     assert all_of_them.floored == 0 and all_of_them.unmeasured.size

@@ -10,6 +10,7 @@ import pytest
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.checkpoint import arrays_of, state_from
@@ -24,7 +25,7 @@ SETTINGS = FitSettings(policy=DensityPolicy(start=0, stop=1, every=4, threshold=
 
 
 def _problem(random_gaussians: Make) -> FitProblem:
-    return fit.problem_of(project(random_gaussians(30, 9.0), VIEWS).numpy(), VIEWS, GRID, 1.0, SETTINGS)
+    return fit.problem_of(Views(project(random_gaussians(30, 9.0), VIEWS).numpy(), VIEWS), GRID, 1.0, SETTINGS)
 
 
 @pytest.mark.parametrize("at", [1, 5, 11])

@@ -10,6 +10,7 @@ import torch
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Truncation
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians
@@ -27,7 +28,7 @@ PLAIN = FitSettings(policy=None, tv_weight=0.0, views_per_step=1, pace=3.0, deca
 
 
 def _problem(truth: Gaussians, settings: FitSettings) -> FitProblem:
-    return fit.problem_of(project(truth, VIEWS).numpy(), VIEWS, GRID, truth.density_unit, settings)
+    return fit.problem_of(Views(project(truth, VIEWS).numpy(), VIEWS), GRID, truth.density_unit, settings)
 
 
 def _disturbed(truth: Gaussians, rng: np.random.Generator) -> Gaussians:
@@ -178,7 +179,7 @@ def test_units_do_not_matter(random_gaussians: Make, rng: np.random.Generator, l
             replace(g, means=g.means * length, log_scales=g.log_scales + np.log(length), density_unit=unit)
             for g in (truth, start)
         ]
-        problem = fit.problem_of(project(scaled[0], views).numpy(), views, Grid.matching(views), unit, settings)
+        problem = fit.problem_of(Views(project(scaled[0], views).numpy(), views), Grid.matching(views), unit, settings)
         return run_steps(fit.init(scaled[1], 0), problem, settings, 10).loss
 
     assert loss(length, density) == pytest.approx(loss(1.0, 1.0), rel=1e-3)
@@ -188,7 +189,7 @@ def test_a_step_on_all_views_takes_the_mean_gradient_and_the_sum_of_the_statisti
     """Adam's first moment after one step is a tenth of the gradient. The statistic of each view is that of its own
     gradient, not of its share of the step: the threshold is for a mean over views."""
     g = random_gaussians(12, extent=6.0)
-    problem = fit.problem_of(project(replace(g, means=g.means + 0.2), VIEWS).numpy(), VIEWS, GRID, 1.0, PLAIN)
+    problem = fit.problem_of(Views(project(replace(g, means=g.means + 0.2), VIEWS).numpy(), VIEWS), GRID, 1.0, PLAIN)
     singles = [fit.step(fit.init(g, 0), problem, PLAIN, 0.0, view=v) for v in range(VIEWS.n_views)]
     together = fit.step(fit.init(g, 0), problem, replace(PLAIN, views_per_step=VIEWS.n_views), 0.0)
     for name in NAMES:
@@ -231,7 +232,7 @@ def test_views_of_nothing_leave_a_model_to_go_on_with(random_gaussians: Make) ->
     policy = DensityPolicy(start=0, stop=2, every=10, prune_below=1e3)
     settings = FitSettings(policy=policy)
     empty = np.zeros((VIEWS.n_views, *VIEWS.detector_shape), np.float32)
-    state = run_steps(fit.init(g, 0), fit.problem_of(empty, VIEWS, GRID, 1.0, settings), settings, 25)
+    state = run_steps(fit.init(g, 0), fit.problem_of(Views(empty, VIEWS), GRID, 1.0, settings), settings, 25)
     assert state.n == 10 and state.step == 25
     assert all(np.isfinite(values).all() for values in state.parameters.values())
 

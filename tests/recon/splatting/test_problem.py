@@ -24,7 +24,7 @@ GRID = Grid.matching(VIEWS)
 
 def test_images_times_scale_are_the_projections(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
-    problem = make_problem(data, VIEWS, GRID, 0.3, Cpu())
+    problem = make_problem(Views(data, VIEWS), GRID, 0.3, Cpu())
     assert problem.half_field == pytest.approx(4.5)
     np.testing.assert_allclose(problem.projections, data, rtol=1e-6)
     later = extend(problem, data[:1], np.array([1.3]))
@@ -34,7 +34,9 @@ def test_images_times_scale_are_the_projections(rng: np.random.Generator) -> Non
 def test_line_integrals_below_zero_weigh_as_air_does(rng: np.random.Generator) -> None:
     data = rng.uniform(0.2, 1.5, (3, 12, 18)).astype(np.float32)
     data[0, ::3, ::4] = -3
-    likely, squares = (make_problem(data, VIEWS, GRID, 0.1, Cpu(), loss=k, ssim_weight=0) for k in ("poisson", "l2"))
+    likely, squares = (
+        make_problem(Views(data, VIEWS), GRID, 0.1, Cpu(), loss=k, ssim_weight=0) for k in ("poisson", "l2")
+    )
     slopes = []
     for problem in (likely, squares):
         image = problem.images[0] + np.float32(0.4)
@@ -45,7 +47,7 @@ def test_line_integrals_below_zero_weigh_as_air_does(rng: np.random.Generator) -
 def test_weights_follow_their_pixels(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
     data[1, 2:4, 4:6] = np.nan
-    problem = make_problem(data, VIEWS, GRID, 1.0, Cpu())
+    problem = make_problem(Views(data, VIEWS), GRID, 1.0, Cpu())
     assert problem.weights[0] is None and problem.weights[1] is not None
     expected = np.ones((12, 18))
     expected[2:4, 4:6] = 0
@@ -63,7 +65,7 @@ def test_values_that_no_matter_explains_weigh_nothing_and_spread_nowhere(
     at = np.s_[1, 3:5, 4:9]
     spoilt[at] = np.clip(value * scale, -3e38, 3e38)
     absent[at] = np.nan
-    wild, expected = (make_problem(d, VIEWS, GRID, unit, Cpu(), ssim_weight=0.25) for d in (spoilt, absent))
+    wild, expected = (make_problem(Views(d, VIEWS), GRID, unit, Cpu(), ssim_weight=0.25) for d in (spoilt, absent))
     image = rng.random((12, 18)).astype(np.float32)
     assert [w is None for w in wild.weights] == [True, False, True]
     measured = wild.weights[1]
@@ -84,7 +86,7 @@ def test_values_that_no_matter_explains_weigh_nothing_and_spread_nowhere(
 def test_what_is_large_but_can_be_squared_keeps_its_weight(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
     data[0, 5, 5] = 0.99e6 * 4.5
-    problem = make_problem(data, VIEWS, GRID, 1.0, Cpu())
+    problem = make_problem(Views(data, VIEWS), GRID, 1.0, Cpu())
     assert problem.weights == (None, None, None)
     loss, slope = problem.loss(problem.images[1], problem.images[0], problem.target_maps[0], None)
     assert np.isfinite(float(loss)) and np.isfinite(slope).all()
@@ -140,24 +142,24 @@ def test_later_views_have_the_shift_roll_and_tilt_of_the_others_or_are_refused(r
     data = rng.random((3, 12, 18)).astype(np.float32)
     same = {"shifts": [[1.0, 2.0]] * 3, "roll": 0.1, "tilt": 0.2}
     leaning = Geometry.parallel(VIEWS.angles, (12, 18), pixel_pitch=0.5, **same)  # type: ignore[arg-type]
-    later = extend(make_problem(data, leaning, GRID, 0.3, Cpu()), data[:1], np.array([1.3])).geometry
+    later = extend(make_problem(Views(data, leaning), GRID, 0.3, Cpu()), data[:1], np.array([1.3])).geometry
     assert later.shifts.tolist() == [[1.0, 2.0]] * 4
     assert later.roll.tolist() == [0.1] * 4 and later.tilt.tolist() == [0.2] * 4
     shifted = Geometry.parallel(VIEWS.angles, (12, 18), pixel_pitch=0.5, shifts=[[0, 0], [1, 0], [0, 0]])
     with pytest.raises(ValueError, match="view to view"):
-        extend(make_problem(data, shifted, GRID, 0.3, Cpu()), data[:1], np.array([1.3]))
+        extend(make_problem(Views(data, shifted), GRID, 0.3, Cpu()), data[:1], np.array([1.3]))
 
 
 def test_a_view_with_only_wild_values_is_refused_with_the_range(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
     data[1] = 1e8
     with pytest.raises(ValueError, match=r"1 of 3 views.*within ±4\.5e\+06.*\[1\]"):
-        make_problem(data, VIEWS, GRID, 1.0, Cpu())
+        make_problem(Views(data, VIEWS), GRID, 1.0, Cpu())
 
 
 def test_what_makes_no_problem_is_refused(rng: np.random.Generator) -> None:
     data = rng.random((3, 12, 18)).astype(np.float32)
     with pytest.raises(ValueError, match="shape"):
-        make_problem(data[:2], VIEWS, GRID, 1.0, Cpu())
+        make_problem(Views(data[:2], VIEWS), GRID, 1.0, Cpu())
     with pytest.raises(ValueError, match="loss must be"):
-        make_problem(data, VIEWS, GRID, 1.0, Cpu(), loss="huber")  # type: ignore[arg-type]
+        make_problem(Views(data, VIEWS), GRID, 1.0, Cpu(), loss="huber")  # type: ignore[arg-type]

@@ -54,11 +54,11 @@ def test_total_variation_weighs_by_the_noise_of_the_data(rng: np.random.Generato
     scale = 0.7 * max(grid.shape) * grid.voxel_size / 2
     data = flat + rng.normal(0, noise * scale, flat.shape)
     settings, count = FitSettings(), flat.size // 24
-    problem = fit.problem_of(data.astype(np.float32), views, grid, 0.7, settings)
+    problem = fit.problem_of(Views(data.astype(np.float32), views), grid, 0.7, settings)
     assert tv_weight(settings, problem, count) == pytest.approx(weight, rel=0.1)
     joined = join_pixels(Views(data.astype(np.float32), views), 2)
     binned, joined_views = joined.data, joined.geometry
-    rough = fit.problem_of(binned, joined_views, grid, 0.7, settings)
+    rough = fit.problem_of(Views(binned, joined_views), grid, 0.7, settings)
     assert tv_weight(settings, rough, count) == pytest.approx(weight, rel=0.1)
     assert tv_weight(FitSettings(tv_weight=0.0), problem, count) == 0
     sharp = replace(problem, change=0.32)  # noise counts by the change of matter: half of it, beyond 0.16

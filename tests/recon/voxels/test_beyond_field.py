@@ -68,11 +68,11 @@ def test_a_sample_within_the_field_gets_the_volume_of_the_method_to_the_bit() ->
 
 
 def test_a_can_as_wide_as_the_field_is_not_taken_for_a_wider_one() -> None:
-    assert sample_radius(views_of(can(COLS / 2)), GEOMETRY) is None
+    assert sample_radius(Views(views_of(can(COLS / 2)), GEOMETRY)) is None
 
 
 def test_the_radius_is_that_of_the_can(wide: tuple[np.ndarray, np.ndarray]) -> None:
-    found = sample_radius(wide[0], GEOMETRY)
+    found = sample_radius(Views(wide[0], GEOMETRY))
     assert found is not None and found.low <= found.radius <= found.high
     assert 0.88 < found.radius / (1.6 * COLS / 2) < 1.05  # a square as large as the disc has 0.886 of its width
     assert 0 < found.density < 0.1
@@ -102,9 +102,9 @@ def test_volume_and_outside_together_explain_the_views(
 def test_a_given_radius_is_taken(wide: tuple[np.ndarray, np.ndarray]) -> None:
     made = recon.reconstruct(wide[0], GEOMETRY, METHOD, use=DataUse(sample_radius=55.0))
     assert made.settings["sample_radius"] == made.settings["sample_radius_high"] == 55.0
-    assert sample_radius(wide[0], GEOMETRY, given=20.0) is None  # within the field
+    assert sample_radius(Views(wide[0], GEOMETRY), given=20.0) is None  # within the field
     known = SampleRadius(50.0, 48.0, 53.0, 0.02)
-    assert sample_radius(wide[0], GEOMETRY, given=known) is known
+    assert sample_radius(Views(wide[0], GEOMETRY), given=known) is known
 
 
 def test_a_small_grid_holds_what_the_field_holds_there(
@@ -117,7 +117,7 @@ def test_a_small_grid_holds_what_the_field_holds_there(
 
 def test_few_views_take_the_end_that_fbp_takes_and_say_that_nothing_is_known() -> None:
     some = GEOMETRY.select(np.arange(0, VIEWS, 4))
-    found = sample_radius(views_of(can(1.6 * COLS / 2), some), some)
+    found = sample_radius(Views(views_of(can(1.6 * COLS / 2), some), some))
     assert found is not None and (found.low, found.high, found.density) == (COLS / 2, 4.5 * COLS / 2, 1.0)
     assert found.radius == pytest.approx(1.6 * COLS / 2, rel=0.15)
 
@@ -132,7 +132,7 @@ def test_what_is_open_of_the_density_adds_a_constant_in_the_middle(
     assert offset_error(half, GEOMETRY, SampleRadius(40, 38, 42, 0.02)) == pytest.approx(1e-4)
     assert offset_error(half, GEOMETRY, None) == 0
     constant = float((made.volume.data - wide[1])[:, middle].mean()) ** 2
-    assert constant < 2 * offset_error(made.volume, GEOMETRY, sample_radius(wide[0], GEOMETRY))
+    assert constant < 2 * offset_error(made.volume, GEOMETRY, sample_radius(Views(wide[0], GEOMETRY)))
 
 
 @pytest.mark.parametrize("given", [-1.0, np.inf])
@@ -151,7 +151,7 @@ def test_wide_views_make_the_density_surer_and_have_no_part_in_fbp(wide: tuple[n
     )
     assert both.reach == GEOMETRY.reach and both.ordinary.sum() == VIEWS
     views = np.concatenate((wide[0], views_of(can(1.6 * COLS / 2), both.select(np.arange(VIEWS, VIEWS + 4)))))
-    alone, seen = sample_radius(wide[0], GEOMETRY), sample_radius(views, both)
+    alone, seen = sample_radius(Views(wide[0], GEOMETRY)), sample_radius(Views(views, both))
     assert alone is not None and seen is not None and seen.density < 0.8 * alone.density
     assert 0.88 < seen.radius / (1.6 * COLS / 2) < 1.05
     fbp = [recon.reconstruct(data, each, "fbp").volume.data for data, each in ((views, both), (wide[0], GEOMETRY))]

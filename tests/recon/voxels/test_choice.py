@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -18,8 +19,14 @@ from recon.voxels.choice import (
     TrialChoice,
     exceeds_standard_error,
     preferred_strength,
-    simplest_within_one_se,
 )
+
+
+def simplest_within_one_se(residuals: Sequence[NDArray[np.float64] | None], least_gain: float = 0.02) -> int | None:
+    """Number of the candidate that a choice takes."""
+    given = (Prediction("", None if each is None else each.tolist()) for each in residuals)
+    return TrialChoice("", least_gain, tuple(given)).at
+
 
 SCATTER = np.array([-0.3, 0.1, 0.4, -0.2, 0.0])  # of views, which all candidates share
 
@@ -85,6 +92,17 @@ def test_from_strengths_that_change_nothing_the_search_goes_on_to_stronger_ones(
 
 def test_trials_that_were_ended_prefer_nothing() -> None:
     assert preferred_strength(lambda _: np.full(5, np.inf), 3.0) is None
+
+
+def test_a_choice_names_the_best_and_what_chance_does_not_tell_from_it() -> None:
+    def verdicts(*residuals: NDArray[np.float64], least_gain: float = 0.0) -> list[str]:
+        given = (Prediction("", each.tolist()) for each in residuals)
+        return TrialChoice("", least_gain, tuple(given)).verdicts
+
+    ended = np.full(5, np.inf)
+    assert verdicts(1.2 + SCATTER, 1 + SCATTER, 1.01 - SCATTER, ended) == ["", "best", "alike", ""]
+    assert verdicts(1.04 + SCATTER, 1 + SCATTER, least_gain=0.05) == ["", ""]  # the best lowers none by so much
+    assert verdicts(ended) == [""]
 
 
 def test_a_choice_is_the_same_from_a_file() -> None:

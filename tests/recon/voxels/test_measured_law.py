@@ -115,7 +115,7 @@ def test_gaps_last_until_the_views_are_as_many_as_the_sample_is_columns_wide(
     """A sample of 56 columns on a field of 28. With gaps the law is known less well."""
     monkeypatch.setattr(
         "recon.voxels.measured_law.sample_radius",
-        lambda data, geometry: SampleRadius(2 * geometry.reach, geometry.reach, 2 * geometry.reach, 0.02),
+        lambda views: SampleRadius(2 * views.geometry.reach, views.geometry.reach, 2 * views.geometry.reach, 0.02),
     )
     views, geometry, open_beam, _ = scan(n, 1e6, cols=28)
     law, gained = measured_law(views, geometry, [n, n], np.random.default_rng(1), open_beam)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.projections.selection import Selection, geometry_of, pivot_of, rows_of, with_pivot
+from beamline.projections.selection import ScanSelection, with_pivot
 from beamline.projections.step import StepDone, StepMemory, option
 from recon.base.registry import unknown
 
@@ -20,13 +20,14 @@ if TYPE_CHECKING:
     from beamline.projections.prepared import PreparedProjections
     from beamline.projections.protocols import ScanPart
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
     from recon.features.calibration.joint import GeometryChange
     from recon.features.calibration.learn import LearntGeometry
 
     Progress = Callable[[int, int], None]
-    GeometryOf = Callable[[Selection, I64], Geometry]
+    GeometryOf = Callable[[ScanSelection, I64], Geometry]
 
 GEOMETRY = "axis", "roll", "tilt", "shifts"
 GAINS = "gains"  # the term that changes line integrals
@@ -106,14 +107,14 @@ class Calibrate:
 
     def learn(
         self,
-        source: ScanSource,
-        selection: Selection,
+        scan: ScanEvidence,
+        selection: ScanSelection,
         frames: NDArray[np.int64],
         geometry_before: GeometryOf,
         progress: Callable[[int, int], None],
     ) -> Calibrated:
         """Calibrate the geometry of these frames with the terms of this step."""
-        return calibrated(source, selection, frames, geometry_before, self.geometry, progress)
+        return calibrated(scan, selection, frames, geometry_before, self.geometry, progress)
 
     def apply(
         self, views: PreparedProjections, angles: NDArray[np.float64], progress: Callable[[int, int], None]
@@ -167,8 +168,8 @@ class Calibrated:
 
 
 def calibrated(
-    source: ScanSource,
-    selection: Selection,
+    scan: ScanEvidence,
+    selection: ScanSelection,
     frames: I64,
     geometry_before: GeometryOf,
     terms: frozenset[str],
@@ -184,12 +185,12 @@ def calibrated(
     Raises:
         DataError: too few views, or nothing in the beam.
     """
-    from beamline.projections.correction import ScanCorrection
+    from beamline.projections.correction import line_integrals_of
     from recon.base.masks import areas
     from recon.features.calibration.learn import learn_geometry
 
-    band = _band(source, selection)
-    views = ScanCorrection(source, band, lambda _: None).at_once(frames)
+    source, band = scan.source, _band(scan.source, selection)
+    views = line_integrals_of(scan, band, frames)
     ids = views.view_ids
     before = geometry_before(band, ids)
     lit = ~areas(views.masked)
@@ -201,11 +202,11 @@ def calibrated(
         raise DataError(
             f"{source.path}: the geometry could not be calibrated: {error}. Leave out --calibrate."
         ) from error
-    looked, middle = rows_of(source, band), (source.shape[0] - 1) / 2
-    whole = geometry_of(source, replace(selection, binning=1, rows=None), 0.0, np.zeros(1))
+    looked, middle = band.detector_rows, (source.shape[0] - 1) / 2
+    whole = replace(selection, binning=1, rows=None).geometry(0.0, np.zeros(1))
     off = 0.0 if before.is_cone else middle - (looked.start + looked.stop - 1) / 2
     change = learnt.change.scaled(band.binning)
-    return Calibrated(ids, change, whole.pixel_pitch, off, pivot_of(source, selection), band.binning, learnt)
+    return Calibrated(ids, change, whole.pixel_pitch, off, selection.pivot, band.binning, learnt)
 
 
 def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
@@ -215,19 +216,19 @@ def _search_memory(part: ScanPart, terms: frozenset[str]) -> int:
     from beamline.projections.correction import at_once_memory
 
     band = _band(part.source, part.selection)
-    rows, frames = rows_of(part.source, band), part.geometry.n_views
+    rows, frames = band.detector_rows, part.geometry.n_views
     pixels = (rows.stop - rows.start) * part.source.shape[1] // band.binning**2
     return at_once_memory(part.source, band, frames) + 4 * _COPIES * frames * pixels
 
 
-def _band(source: ScanSource, selection: Selection) -> Selection:
+def _band(source: ScanSource, selection: ScanSelection) -> ScanSelection:
     """Rows around the middle of those used, with pixels binned so that a volume of them is quick.
 
     Of the rows around a region it takes those of the whole volume, for which the region is cut out of it.
     """
     from recon.features.calibration.learn import COLS, ROWS
 
-    used = rows_of(source, replace(selection, rows=selection.axis_rows or selection.rows))
+    used = replace(selection, rows=selection.axis_rows or selection.rows).detector_rows
     height = used.stop - used.start
     binning = max(selection.binning, min(math.ceil(source.shape[1] / COLS), height))
     n = min(height, ROWS * binning)

@@ -13,13 +13,14 @@ from beamline.core.text import count, frames_text
 from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
-from beamline.projections.selection import Selection, cone_of, geometry_of, rows_of
+from beamline.projections.selection import ScanSelection
 from beamline.projections.step import StepDone, StepMemory, option
 from beamline.projections.usable_views import UsableViews, usable_views
 from recon.base.volume import Grid
 
 if TYPE_CHECKING:
     from beamline.storage.readers.base import ScanSource
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
 
@@ -63,16 +64,16 @@ class Jumps:
 
     def place(
         self,
-        source: ScanSource,
-        selection: Selection,
+        scan: ScanEvidence,
+        selection: ScanSelection,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        if stated_poses(source, selection) is not None:  # it states where the sample was
+        if stated_poses(scan.source, selection) is not None:  # it states where the sample was
             return Unmoved(usable.frames)
         if self.corrects_jumps:
-            return find_jumps(source, selection, usable.frames, usable.jumps, axis_col, progress)
+            return find_jumps(scan, selection, usable.frames, usable.jumps, axis_col, progress)
         where = frames_text(usable.jumps)
         sentence = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
         return SampleJumps(usable.frames, sentence if usable.jumps.size else "")
@@ -100,8 +101,8 @@ class SampleJumps:
 
 
 def find_jumps(
-    source: ScanSource,
-    selection: Selection,
+    scan: ScanEvidence,
+    selection: ScanSelection,
     frames: I64,
     jumps: I64,
     axis_col: float,
@@ -120,14 +121,14 @@ def find_jumps(
     jumps = np.array([row for row in jumps.tolist() if (frames < row).any() and (frames >= row).any()], np.int64)
     if not jumps.size:
         return SampleJumps(frames)
-    if cone_of(source, selection) is not None:
+    if selection.cone is not None:
         where = frames_text(jumps)
         return SampleJumps(
             frames,
             f"The sample jumped at {where}. Views of a cone beam are not compared for that: they are used as if it had "
             "not moved. Choose those of one side with --views.",
         )
-    coarse, runs, most = _CoarseViews(source, selection, axis_col), [frames], jumps.size * (jumps.size + 1) // 2
+    coarse, runs, most = _CoarseViews(scan, selection, axis_col), [frames], jumps.size * (jumps.size + 1) // 2
     part = np.searchsorted(jumps, frames, side="right")
     steady = frames[np.bincount(part)[part] >= LEAST]  # views between two alarms are no part of a comparison
     real, at, n = list[int](), 0, 0
@@ -172,13 +173,13 @@ def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
 class _CoarseViews:
     """Coarse pixels of some rows, in which parts of a scan are compared."""
 
-    source: ScanSource
-    selection: Selection
+    scan: ScanEvidence
+    selection: ScanSelection
     axis_col: float
 
     def clearness(self, frames: I64, part: I64) -> float:
         """How clearly the sample stood elsewhere in one of two parts [view] of these rows; 1 is the limit."""
-        from beamline.projections.correction import ScanCorrection
+        from beamline.projections.correction import line_integrals_of
         from recon.base.masks import areas
         from recon.voxels.displacement import Displacement, displacements, judge
 
@@ -187,9 +188,9 @@ class _CoarseViews:
         looked = np.sort(np.concatenate([own[:: 1 if own.size <= _SHORT else step] for own in some]))
         moves: list[Displacement] | None = None
         for cols, rounds in _LEVELS:
-            band = self.band(cols)
-            views = ScanCorrection(self.source, band, lambda _: None).at_once(frames[looked])
-            geometry = geometry_of(self.source, band, self.axis_col, self.source.table.angles[views.view_ids])
+            band = _band(self.scan.source, self.selection, cols)
+            views = line_integrals_of(self.scan, band, frames[looked])
+            geometry = band.geometry(self.axis_col, self.scan.table.angles[views.view_ids])
             group = part[np.searchsorted(frames, views.view_ids)]
             seen = views.data, geometry, group, ~areas(views.masked)
             moves = displacements(*seen, moves, rounds)
@@ -200,30 +201,31 @@ class _CoarseViews:
         jumped = (1 - _HELPS) * still.overall / moved.overall if far >= LARGEST else 0.0
         return max(jumped, still.together / still.alone / (1 + _HELPS), other)
 
-    def band(self, cols: int) -> Selection:
-        """Binned pixels, and rows around the middle of those that are used, also outside them."""
-        width, height = self.source.shape[1] // self.selection.binning, self.source.shape[0]
-        binning = self.selection.binning * max(1, math.ceil(width / cols))
-        used = rows_of(self.source, self.selection)
-        n = min(_ROWS * binning, height)
-        first = min(max((used.start + used.stop - n) // 2, 0), height - n)
-        return replace(self.selection, rows=(first, first + n), binning=min(binning, n))
+
+def _band(source: ScanSource, selection: ScanSelection, cols: int) -> ScanSelection:
+    """Binned pixels, and rows around the middle of those that are used, also outside them."""
+    width, height = source.shape[1] // selection.binning, source.shape[0]
+    binning = selection.binning * max(1, math.ceil(width / cols))
+    used = selection.detector_rows
+    n = min(_ROWS * binning, height)
+    first = min(max((used.start + used.stop - n) // 2, 0), height - n)
+    return replace(selection, rows=(first, first + n), binning=min(binning, n))
 
 
-def _search_memory(source: ScanSource, selection: Selection) -> int:
+def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
     """Bytes that `find_jumps` takes at most; 0 if the flags in the file name no jump, and none are made."""
     from beamline.projections.correction import at_once_memory
+    from beamline.storage.rules.evidence import ScanEvidence
     from recon.voxels.displacement import SWEEPS
     from recon.voxels.methods import OsSirtTv
 
     asked = selection.step(Preparation)
-    jumps = usable_views(source, asked.uses_flags).jumps
-    if cone_of(source, selection) is not None or not (asked.judged or jumps.size):
+    jumps = usable_views(ScanEvidence(source), asked.uses_flags).jumps
+    if selection.cone is not None or not (asked.judged or jumps.size):
         return 0
-    coarse = _CoarseViews(source, selection, (source.shape[1] - 1) / 2)
     n = min(source.table.views.size, _VIEWS + 2 * _SHORT)
-    band = coarse.band(_LEVELS[-1][0])
-    views = geometry_of(source, band, coarse.axis_col, np.linspace(0, math.pi, n, endpoint=False))
+    band = _band(source, selection, _LEVELS[-1][0])
+    views = band.geometry((source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
     copy = 4 * n * math.prod(views.detector_shape)
     work = OsSirtTv(iterations=SWEEPS, momentum=True).memory(views, Grid.matching(views), weighted=True)
     return copy + max(at_once_memory(source, band, n), work + _COPIES * copy)

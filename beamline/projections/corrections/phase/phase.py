@@ -12,7 +12,7 @@ from beamline.projections.protocols import ScanPart, ViewFilter
 from beamline.projections.step import StepDone, StepMemory, option, positive
 
 if TYPE_CHECKING:
-    from beamline.projections.selection import Selection
+    from beamline.projections.selection import ScanSelection
     from beamline.storage.readers.base import ScanSource
     from recon.base.geometry import Geometry
     from recon.features.phase import Paganin
@@ -123,7 +123,7 @@ class Phase:
         return StepMemory((7 if self.unsharp is None else 9) * part.view_bytes(paganin.reach), search)
 
     def estimated(
-        self, source: ScanSource, selection: Selection, views: Projections, geometry: Geometry
+        self, source: ScanSource, selection: ScanSelection, views: Projections, geometry: Geometry
     ) -> Phase | None:
         """This step with what these views show; None where it was said, or where nothing is certain."""
         from recon.features.phase import LEAST_DROP, length_by_held_out_views
@@ -149,7 +149,7 @@ class Phase:
         )
         return replace(self, length=filter.length, explanation=f"{overshoot.in_words()} {why}")
 
-    def on(self, source: ScanSource, selection: Selection) -> tuple[ViewFilter | None, StepDone]:
+    def on(self, source: ScanSource, selection: ScanSelection) -> tuple[ViewFilter | None, StepDone]:
         if self.material is None or (self.material == _AUTO and self.length is None):
             why = self.explanation or (
                 self.unsharp and "Without a filter --unsharp is not used; give --phase paganin:RATIO."
@@ -163,18 +163,17 @@ class Phase:
 
         return ViewFilter(apply, paganin.reach, "--phase mixes"), StepDone(sentence, {"phase": sentence})
 
-    def filter_of(self, source: ScanSource, selection: Selection) -> tuple[Paganin, str]:
+    def filter_of(self, source: ScanSource, selection: ScanSelection) -> tuple[Paganin, str]:
         """The phase filter for pixels of the selection, and a sentence about it.
 
         Raises:
             ConfigError: distance, energy or pixel size are not known, or give a filter that is wider than the frame.
         """
-        from beamline.projections.selection import cone_of, pixel_size
         from recon.features.phase import Paganin, length_of
 
         if source.row_pitch_mm is not None:
             raise ConfigError(f"--phase needs square pixels; those of {source.path} are not square.")
-        cone, pitch = cone_of(source, selection), pixel_size(source, selection)
+        cone, pitch = selection.cone, selection.pixel_size_mm
         energy = source.energy_kev if self.energy_kev is None else self.energy_kev
         distance = self.distance_mm
         if distance is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import psutil
@@ -17,6 +16,7 @@ from beamline.features.trials.trial import MethodTrial, Outcome
 from beamline.projections.prepared import with_views_held_out
 from recon.assess.metrics import psnr
 from recon.base.geometry import Geometry
+from recon.base.method import RunControl
 from recon.base.volume import Grid, Volume
 from recon.methods import by_name, names_of_one_volume
 from recon.voxels.fbp import fbp
@@ -40,8 +40,8 @@ def data() -> TrialData:
     return TrialData(prepared, half.truth(Grid.matching(views)))
 
 
-def run(trial: MethodTrial, data: TrialData, seed: int, *clocks: Any) -> Outcome:
-    return run_trial(trial, data, seed, *clocks)[0]
+def run(trial: MethodTrial, data: TrialData, control: RunControl | None = None) -> Outcome:
+    return run_trial(trial, data, control or RunControl())[0]
 
 
 @pytest.mark.parametrize("method", ["fbp", "fista-tv", "sirt"])
@@ -58,15 +58,15 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str) 
         held = np.where(measured, held, np.float32(filled))
         given = replace(data.prepared, projections=views, held_out=(held, unseen), measured=measured)
         trial = MethodTrial("method", method, data.geometry.n_views)
-        found = run(trial, replace(data, prepared=given), 0)
+        found = run(trial, replace(data, prepared=given))
         figures.append([*found.metrics.values(), *found.squared_residuals])
     np.testing.assert_array_equal(figures[0], figures[1])
-    blind = run(trial, replace(data, prepared=replace(given, measured=None)), 0)
+    blind = run(trial, replace(data, prepared=replace(given, measured=None)))
     assert blind.metrics["residual_held_out"] > 1.2 * found.metrics["residual_held_out"]
 
 
 def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> None:
-    found = run(MethodTrial("method", "fbp", data.geometry.n_views), data, 0)
+    found = run(MethodTrial("method", "fbp", data.geometry.n_views), data)
     expected = fbp(data.prepared.projections.data, data.geometry, filter="hann")
     assert data.truth is not None and data.prepared.held_out is not None
     assert found.metrics["psnr"] == pytest.approx(psnr(data.truth, expected))
@@ -87,7 +87,7 @@ def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> N
     assert data.prepared.held_out is not None
     unseen, geometry = data.prepared.held_out
     spoilt = replace(data, prepared=replace(data.prepared, held_out=(2 * unseen, geometry)))
-    kept, other = (run(trial, d, 0).metrics for d in (data, spoilt))
+    kept, other = (run(trial, d).metrics for d in (data, spoilt))
     assert kept["psnr"] == other["psnr"] and kept["residual_held_out"] < other["residual_held_out"]
 
 
@@ -100,7 +100,7 @@ def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) 
     ticks = itertools.count()
     trial = MethodTrial("method", method, 27, seconds_asked=8.0)
     alone = replace(data, prepared=replace(data.prepared, held_out=None))
-    found = run(trial, alone, 0, lambda: 0.1 * next(ticks))
+    found = run(trial, alone, RunControl(now=lambda: 0.1 * next(ticks)))
     own_length = not by_name(method).ended_by(8.0)
     assert (0 if own_length else 0.6 * 8) < found.seconds < 1.1 * 8
     assert np.isfinite(found.metrics["psnr"])
@@ -116,7 +116,7 @@ def test_a_method_that_refuses_or_lacks_memory_is_an_outcome(
         raise error
 
     monkeypatch.setattr(module, "run_on", refuse)
-    outcome, volume = run_trial(MethodTrial("method", "fbp", 27), data, 0)
+    outcome, volume = run_trial(MethodTrial("method", "fbp", 27), data)
     assert (outcome.status, volume) == ("failed", None) and said in outcome.message
 
 
@@ -125,5 +125,5 @@ def test_the_memory_of_a_trial_is_its_own_and_not_that_of_earlier_ones(data: Tri
         pytest.skip("only Linux counts the peak anew")
     ballast = np.ones(90_000_000)  # 720 MB
     del ballast
-    peak = run(MethodTrial("method", "fbp", 27), data, 0).peak_bytes
+    peak = run(MethodTrial("method", "fbp", 27), data).peak_bytes
     assert peak is not None and peak < psutil.Process().memory_info().rss + 3e8

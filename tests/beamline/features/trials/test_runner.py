@@ -36,12 +36,14 @@ FILES = {"tradeoff.csv", "tradeoff.html", "quality.png"}
 def _options(tmp_path: Path, **changes: Any) -> ComparedScan:
     if not (tmp_path / "scan.h5").exists():
         write_exchange(tmp_path / "scan.h5", SCAN)
-    scan = ComparedScan(SourceOptions(tmp_path / "scan.h5"), Selection(axis_col=SCAN.axis_col), tmp_path / "out")
+    scan = ComparedScan(SourceOptions(tmp_path / "scan.h5"), Selection(axis_col=SCAN.axis_col))
     return replace(scan, **{"methods": ("r2", "fbp"), "command": "beamline tradeoff scan.h5", **changes})
 
 
 def run_tradeoff(scan: ComparedScan, sink: Callable[[Event], None] = lambda e: None) -> TrialTable:
-    return run_comparison(partial(planned_tradeoff, scan), scan, sink, SystemClock())
+    return run_comparison(
+        partial(planned_tradeoff, scan), scan.source.path, Path(scan.source.path).parent / "out", sink, SystemClock()
+    )
 
 
 def _made_up(trial: MethodTrial, *_: object) -> tuple[Outcome, Any]:

@@ -14,9 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from beamline.core.files import write_table
 from beamline.core.machine import machine
 from beamline.features.trials import table as module
-from beamline.features.trials.table import sentences, to_html, write_table
+from beamline.features.trials.table import sentences, to_html
 from beamline.features.trials.tradeoff import plan, plan_in_equal_time
 from beamline.features.trials.trial import LEAST_GAIN, MethodTrial, Outcome, TrialTable
 from recon.methods import by_name, names_of_one_volume
@@ -39,7 +40,7 @@ def _judged(*trials: tuple[float, list[float]]) -> TrialTable:
                 metrics={"residual_held_out": sum(left) ** 0.5 / 10}, squared_residuals=left)
         for n, (seconds, left) in enumerate(trials)
     ]  # fmt: skip
-    return TrialTable("tradeoff", "", tuple(outcomes), "residual_held_out", machine(), {}, "")
+    return TrialTable("tradeoff", "", tuple(outcomes), "residual_held_out", machine(), {}, "", asks_costs=True)
 
 
 def test_a_gain_within_the_scatter_of_the_views_is_none() -> None:
@@ -153,7 +154,9 @@ FIT = MethodTrial("method", "r2", 10, settings={"steps": 100})
 
 def _table(*outcomes: Outcome, by: str = "psnr") -> TrialTable:
     command = "beamline tradeoff 'a <b>.h5'"
-    return TrialTable("tradeoff", "What accuracy costs", outcomes, by, machine(), {"file": "a <b>.h5"}, command)
+    return TrialTable(
+        "tradeoff", "What accuracy costs", outcomes, by, machine(), {"file": "a <b>.h5"}, command, asks_costs=True
+    )
 
 
 def _done(trial: MethodTrial, seconds: float, psnr: float, memory: int | None = 10**8) -> Outcome:
@@ -176,7 +179,7 @@ def test_each_further_decibel_has_its_price() -> None:
 
 def test_the_csv_holds_what_was_measured_and_nothing_where_nothing_was(tmp_path: Path) -> None:
     table = _table(_done(BASE, 2.0, math.inf), Outcome(FIT, "failed", message='no "room", said\nthe system'))
-    write_table(tmp_path, table)
+    write_table(tmp_path / "tradeoff.csv", table.records)
     first, second = csv.DictReader(io.StringIO((tmp_path / "tradeoff.csv").read_text(encoding="utf-8")))
     assert (first["seconds"], first["psnr"], first["ssim3d"], first["steps"]) == ("2.0", "", "0.5", "")
     assert (second["status"], second["seconds"], second["steps"]) == ("failed", "", "100")
@@ -198,6 +201,6 @@ def test_a_trial_far_below_the_best_is_drawn_at_the_lower_edge(monkeypatch: pyte
         Outcome(MethodTrial("method", method, 10), "done", 1.0 + at, 10**8, {"psnr": db})
         for at, (method, db) in enumerate((("fbp", 30.0), ("sirt", 25.0), ("cgls", 1.0)))
     ]
-    module.quality_plot(TrialTable("tradeoff", "", tuple(outcomes), "psnr", {}, {}, ""))
+    module.quality_plot(TrialTable("tradeoff", "", tuple(outcomes), "psnr", {}, {}, "", asks_costs=True))
     points = {line.get_marker(): line.get_ydata().tolist() for line in drawn[0].axes[0].lines if line.get_ydata().size}
     assert points["v"] == [18.0] and {30.0, 25.0} <= {db for values in points.values() for db in values}

@@ -14,8 +14,9 @@ from beamline.monitor.checks import CHECKS
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
-from beamline.projections.usable_views import WARNED_SHARE, regions_of
+from beamline.projections.usable_views import WARNED_SHARE, Regions, regions_of
 from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.rules.treatment import treatment_of
 from recon.prep.resample import Resampling
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
@@ -28,12 +29,13 @@ def flag(view: int, region: tuple[int, int, int, int] | None, level: Level = Lev
     return Flag(NAME, level, view, 1.0, 0.5, "", region, **more)  # type: ignore[arg-type]
 
 
-def found(*flags: Flag, frames: int = 12) -> FrameFlags:
-    return FrameFlags.of_flags([[f for f in flags if f.frame == row] for row in range(frames)])
+def found(*flags: Flag, frames: int = 12) -> Regions:
+    every = FrameFlags.of_flags([[f for f in flags if f.frame == row] for row in range(frames)])
+    return regions_of(treatment_of(every, np.ones(frames, np.bool_), SHAPE))
 
 
 def test_a_region_and_its_margin_weigh_less_of_an_alarm_nothing() -> None:
-    regions = regions_of(found(flag(3, (4, 8, 10, 18)), flag(5, (4, 8, 10, 18), Level.ALARM)), SHAPE)
+    regions = found(flag(3, (4, 8, 10, 18)), flag(5, (4, 8, 10, 18), Level.ALARM))
     assert sorted({*regions.frames.tolist()}) == [3, 5]
     weights = regions.weights(np.array([3, 4, 5]), slice(0, 20), 1, SHAPE)
     assert weights is not None
@@ -43,7 +45,7 @@ def test_a_region_and_its_margin_weigh_less_of_an_alarm_nothing() -> None:
 
 
 def test_rows_that_are_chosen_and_binned_pixels_take_their_part() -> None:
-    regions = regions_of(found(flag(3, (4, 8, 10, 18), Level.ALARM)), SHAPE)
+    regions = found(flag(3, (4, 8, 10, 18), Level.ALARM))
     weights = regions.weights(np.array([3]), slice(5, 13), 2, (4, 20))
     assert weights is not None
     np.testing.assert_allclose(weights[0, :2, 5:9], 0)
@@ -55,7 +57,7 @@ def test_rows_that_are_chosen_and_binned_pixels_take_their_part() -> None:
 @pytest.mark.parametrize("binning", [1, 2])
 def test_a_region_of_views_that_are_turned_lies_where_its_pixels_went(binning: int) -> None:
     resampling = Resampling(SHAPE, 0.2, binning=binning)
-    plain = regions_of(found(flag(3, (4, 12, 22, 32), Level.ALARM)), SHAPE)
+    plain = found(flag(3, (4, 12, 22, 32), Level.ALARM))
     shape = SHAPE[0] // binning, SHAPE[1] // binning
     straight = plain.weights(np.array([3]), slice(0, 20), binning, shape)
     turned = replace(plain, resampling=resampling).weights(np.array([3]), slice(0, 20), binning, shape)
@@ -73,9 +75,8 @@ def test_a_region_of_views_that_are_turned_lies_where_its_pixels_went(binning: i
 def test_without_a_region_or_with_most_of_the_view_the_whole_view_is_meant(
     region: tuple[int, int, int, int] | None,
 ) -> None:
-    assert not regions_of(found(flag(3, region)), SHAPE).frames.size
-    both = found(flag(3, (4, 8, 10, 18)), Flag(OTHER, Level.WARN, 3, 1.0, 0.5, "", region))
-    regions = regions_of(both, SHAPE)
+    assert not found(flag(3, region)).frames.size
+    regions = found(flag(3, (4, 8, 10, 18)), Flag(OTHER, Level.WARN, 3, 1.0, 0.5, "", region))
     assert regions.frames.size == 0
 
 

@@ -20,7 +20,7 @@ from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.corrections.rings.rings import Rings
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import PrepStep, ScanPart, ScanStep, ViewStep
-from beamline.projections.selection import Selection, geometry_of
+from beamline.projections.selection import Selection
 from beamline.projections.step import StepMemory
 from beamline.reconstruct.memory import ReconMemory, recon_memory_of
 from beamline.reconstruct.options import OutputPaths, ReconOptions
@@ -57,8 +57,8 @@ def peak(work: Callable[[], object]) -> int:
 
 
 def part_of(source: ScanSource, *steps: PrepStep) -> ScanPart:
-    selection, views = Selection(steps=steps), source.table.kinds == 0
-    return ScanPart(source, selection, geometry_of(source, selection, source.shape[1] / 2, source.table.angles[views]))
+    selection, views = Selection(steps=steps).of(source), source.table.kinds == 0
+    return ScanPart(source, selection, selection.geometry(source.shape[1] / 2, source.table.angles[views]))
 
 
 def needs(path: Path, *steps: PrepStep) -> ReconMemory:
@@ -93,10 +93,8 @@ def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep, shape:
     disc = 2 * np.sqrt(np.clip(0.36 - x**2, 0, None)) - 0.1 + 0.03 * x
     rng = np.random.default_rng(0)
     views = disc + rng.normal(0, 0.01, shape) + rng.normal(0, 0.02, (rows, cols))  # noise, and gains of pixels
-    unread: Any = None  # only its file is
-    part = ScanPart(
-        unread, Selection(), Geometry.parallel(angles, (rows, cols), pixel_pitch=1.0, axis_col=(cols - 1) / 2)
-    )
+    unread: Any = None  # only its file is, and its selection
+    part = ScanPart(unread, unread, Geometry.parallel(angles, (rows, cols), pixel_pitch=1.0, axis_col=(cols - 1) / 2))
 
     def work() -> None:
         data, ones = views.astype(np.float32), np.ones(n, np.float32)

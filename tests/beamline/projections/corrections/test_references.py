@@ -12,7 +12,8 @@ from beamline.features.files.validate import source_findings
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
-from beamline.storage.rules.references import references_usable
+from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.light import references_usable
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 from tests.beamline.prepared_views import prepare
@@ -74,7 +75,7 @@ def test_a_scan_without_a_good_group_is_refused_and_an_option_overrides(levels: 
     scan = source(levels, levels)
     with pytest.raises(DataError, match=f"reconstructed. {said}.*--references accept"):
         prepare(scan, SELECTION)
-    errors = [f for f in source_findings(scan) if f.severity == "error"]
+    errors = [f for f in source_findings(ScanEvidence(scan)) if f.severity == "error"]
     n = 1 if "54" in said else 2  # the figures of two groups differ but where all of the pixels are at their end
     rules = [finding.rule for finding in errors if finding.rule != "light"]  # which tells of darks above the views, too
     assert rules == ["bad-references"] * n
@@ -95,4 +96,4 @@ def test_flats_darker_than_the_views_are_refused_where_the_exposures_are_known()
     found, warnings = prepare(fine, SELECTION)
     assert (found.geometry.n_views, warnings) == (45, [])
     fine.table.exposures[np.array(fine.table.kinds) == FrameKind.FLAT] /= 10  # ten times the light a second: no fault
-    assert list(references_usable(fine)) == []
+    assert list(references_usable(ScanEvidence(fine))) == []

@@ -15,6 +15,7 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.projections.views import evidence_of
 from recon.assess.metrics import psnr
 from recon.base.volume import Grid
 from recon.prep.resample import Distortion
@@ -98,11 +99,11 @@ def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion
     plain = Air("none"), Preparation(zinger_threshold=1e9)  # zingers are judged by the rows that are there
     selection = Selection(binning=binning, steps=(*plain, TiltAndLens(1.5, lens)))
     source, frames = _source(1.5), np.arange(2, 30)
-    correction = ScanCorrection(source, selection, pytest.fail)
+    correction = ScanCorrection(evidence_of(source, selection), selection.of(source), pytest.fail)
     whole = correction.at_once(frames).data
     np.testing.assert_array_equal(correction.at_once(frames, slice(9, 12)).data, whole[:, 9:12])
     rows = replace(selection, rows=(8 * binning, 14 * binning))
-    band = ScanCorrection(source, rows, pytest.fail).at_once(frames).data
+    band = ScanCorrection(evidence_of(source, rows), rows.of(source), pytest.fail).at_once(frames).data
     np.testing.assert_array_equal(band, whole[:, 8:14])
     out = np.empty(whole.shape, np.float32)
     np.testing.assert_array_equal(correction.in_batches(frames, out, 9, lambda *_: None).data, whole)

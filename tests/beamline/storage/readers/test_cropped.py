@@ -64,7 +64,7 @@ def test_regions_of_flags_move_with_the_columns(cols: tuple[int, int], left: int
     source: Any = cropped(_Flagged(), cols)
     assert source.axis_col == 52.5 - cols[0]
     treated = treatment_of(source.table.flags, np.ones(3, np.bool_), source.shape)
-    (box,) = regions_of(treated.flags, source.shape).boxes
+    (box,) = regions_of(treated).boxes
     assert box[2:].tolist() == [left, right] and treated.masked.tolist() == [False, True, False]
 
 
@@ -73,7 +73,7 @@ def test_the_lens_keeps_its_centre() -> None:
     places = []
     for cols in ((0, 100), (30, 90)):
         source: Any = cropped(_Flagged(), cols)
-        found = TiltAndLens(distortion=lens).of(source, Selection())
+        found = TiltAndLens(distortion=lens).of(source, Selection().of(source))
         assert found is not None
         places.append(found.places(source.shape, 0)[1] + cols[0])
     np.testing.assert_allclose(places[1], places[0][:, 30:90])

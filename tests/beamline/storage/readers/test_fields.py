@@ -14,7 +14,7 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.features.files.validate import describe, validate
 from beamline.projections.selection import Selection
-from beamline.projections.views import checked_views
+from beamline.projections.views import checked_views, evidence_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.fields import EXCHANGE, NXTOMO, Entry
 from beamline.storage.readers.open import SourceOptions, open_scan
@@ -328,7 +328,7 @@ def _refused(path: Path, selection: Selection) -> str:
     """Why `recon` refuses a scan; "" if it does not."""
     with open_scan(path) as source:
         try:
-            checked_views(source, selection, lambda sentence: None)
+            checked_views(evidence_of(source, selection), selection.of(source), lambda sentence: None)
         except DataError as error:
             return str(error)
     return ""

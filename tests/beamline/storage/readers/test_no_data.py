@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from beamline.storage.readers.open import open_scan
-from beamline.storage.rules.scan import scan_findings
+from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.scan import findings_of
 from tests.beamline.scans import write_nxtomo
 
 SHAPE, FLATS, VIEWS = (24, 40), 5, 20
@@ -57,7 +58,7 @@ def test_marked_pixels_hold_no_counts_and_a_counter_needs_no_darks(
         assert not source.read([1, -1])[:, MASK > 0].any()
         np.testing.assert_array_equal(source.read([-1], slice(10, 20))[0], source.read([-1])[0, 10:20])
         assert source.read([-1])[0, 0, 0] > 200
-        assert not [finding for finding in scan_findings(source) if finding.rule == "references"]
+        assert not [finding for finding in findings_of(ScanEvidence(source)) if finding.rule == "references"]
         assert "counted photons" in str(source.attributes["darks"])
 
 
@@ -74,7 +75,7 @@ def test_cameras_need_darks(
     tmp_path: Path, rng: np.random.Generator, gain: float, offset: int, dtype: str, mark: int | None
 ) -> None:
     with open_scan(_scan(tmp_path / "s.nx", rng, dtype, mark, None, gain, offset)) as source:
-        assert [f.message for f in scan_findings(source) if "Counts without darks" in f.message]
+        assert [f.message for f in findings_of(ScanEvidence(source)) if "Counts without darks" in f.message]
 
 
 @pytest.mark.parametrize("where", [np.s_[:, :, 5:20], np.s_[:, 4:9, 5:20], np.s_[:5]])

@@ -17,7 +17,7 @@ from beamline.core.errors import DataError
 from beamline.core.sinks import Note
 from beamline.features.files.validate import describe, validate
 from beamline.projections.selection import Selection
-from beamline.projections.views import checked_views
+from beamline.projections.views import checked_views, evidence_of
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.stored_order import SINOGRAM
 
@@ -81,7 +81,7 @@ def test_a_sinogram_is_said_to_be_one(tmp_path: Path, turned: bool, other: str) 
     np.save(tmp_path / "s.npy", sinogram.T if turned else sinogram)
     with open_scan(SourceOptions(tmp_path / "s.npy", angles=np.arange(20) * 0.1, quantity="line_integrals")) as source:
         sentences = list[str]()
-        checked_views(source, Selection(), sentences.append)
+        checked_views(evidence_of(source, Selection()), Selection().of(source), sentences.append)
     (said,) = [each for each in sentences if "sinogram" in each]
     assert isinstance(said, Note) and "20 views and 9 columns" in said and other in said
 

@@ -17,6 +17,7 @@ from beamline.monitor.digest import digest
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.parts import join
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import parts_joined
 from beamline.storage.writers import layout
 from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
@@ -61,7 +62,7 @@ def test_it_is_the_joined_scan(tmp_path: Path, rng: np.random.Generator) -> None
         for rows, seen in zip(chosen, pixels, strict=True):
             np.testing.assert_array_equal(source.read(rows, slice(1, 3)), seen)
         assert (source.finished, source.checksummed, source.plan) == (True, checksummed, plan)
-        assert list(parts_joined(source)) == []  # it is all of it
+        assert list(parts_joined(ScanEvidence(source))) == []  # it is all of it
     with SourceOptions(parts[-1], earlier=tuple(parts[:-1]), quantity="counts").open() as replaced:
         assert len(replaced.table) == 25
 

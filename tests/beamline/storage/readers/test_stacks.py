@@ -12,6 +12,7 @@ import pytest
 
 from beamline.core.errors import DataError
 from beamline.storage.readers.open import SourceOptions, open_scan
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.stored_order import axis_vertical
 
 PATHS: dict[str, Any] = {
@@ -173,9 +174,9 @@ def test_the_advice_for_exchanged_rows_and_columns_gives_no_mirror_image(tmp_pat
         group["theta"].attrs["units"] = "deg"
     given: dict[str, Any] = {"darks_path": "dark", "flats_path": "flat", "angles_path": "theta", "data_path": "proj"}
     with open_scan(SourceOptions(tmp_path / "s.h5", **(given if store == "stacks" else {}))) as source:
-        (finding,) = axis_vertical(source)
+        (finding,) = axis_vertical(ScanEvidence(source))
     options = dict(re.findall(r"--(\w+)-path ([\w/,:]+\w)", finding.message))
     given |= {f"{name}_path": where for name, where in options.items()}
     with open_scan(SourceOptions(tmp_path / "s.h5", **given)) as source:
         np.testing.assert_array_equal(source.read(slice(4, None)), views)
-        assert not [*axis_vertical(source)]
+        assert not [*axis_vertical(ScanEvidence(source))]

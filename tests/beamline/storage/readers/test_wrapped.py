@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from beamline.features.files.validate import source_findings
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.transforms import wrapped_edges
+from beamline.storage.rules.evidence import ScanEvidence
 from tests.beamline.array_source import scan_of
 
 COLS = np.arange(256) - 127.5
@@ -58,5 +59,5 @@ def test_validate_says_that_numbers_wrapped_and_nothing_of_the_light(dtype: Any,
     darks = np.random.default_rng(6).normal(400, 3, (3, 32, 256)).round()
     parts: list[NDArray[Any]] = [part.astype(np.int64).astype(np.uint16).view(dtype) for part in (darks, flats, views)]
     source = scan_of(parts[0], parts[1], parts[2], np.linspace(0, np.pi, 12, endpoint=False), dtype)
-    found = source_findings(cast(ScanSource, source))
+    found = source_findings(ScanEvidence(cast(ScanSource, source)))
     assert [finding.rule for finding in found if finding.severity != "info"] == ["wrapped-numbers"]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from beamline.storage.rules import Finding
 from beamline.storage.rules.angles import angles_spread
 from beamline.storage.rules.angles_shown import angles_in_order, angles_seen, coarse_views
+from beamline.storage.rules.evidence import ScanEvidence
 from tests.beamline.array_source import ArraySource, scan_of
 
 ROWS, COLS, LIGHT, DARK = 8, 96, 3e4, 100.0
@@ -39,7 +40,7 @@ def scan(balls: Balls, true: NDArray[np.float64], stated: NDArray[np.float64], a
 
 
 def told(source: ArraySource) -> list[Finding]:
-    seen = coarse_views(source)
+    seen = coarse_views(ScanEvidence(source))
     return [] if seen is None else list(angles_seen(seen))
 
 
@@ -89,7 +90,7 @@ def test_a_rod_about_an_axis_far_from_the_middle_is_never_refused(axis: float) -
 
 
 def ordered(source: ArraySource) -> list[Finding]:
-    seen = coarse_views(source)
+    seen = coarse_views(ScanEvidence(source))
     return [] if seen is None else list(angles_in_order(seen))
 
 
@@ -133,7 +134,7 @@ def test_any_order_of_frames_with_their_own_angles_is_right(balls: Balls, true: 
 
 def test_views_that_count_up_are_asked_about_unless_a_plan_of_ours_states_them() -> None:
     source: Any = scan(WITHIN, turn(60, 60), np.arange(60.0))
-    (asked,) = angles_spread(source)
+    (asked,) = angles_spread(ScanEvidence(source))
     source.plan = {"angles_deg": np.arange(180.0)}
-    (known,) = angles_spread(source)
+    (known,) = angles_spread(ScanEvidence(source))
     assert "do they count the frames?" in asked.message and "count" not in known.message

@@ -16,6 +16,7 @@ from beamline.features.files.validate import validate
 from beamline.storage.readers.base import Quantity
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules import Finding
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.stored_order import change_of_rows, views_first
 from tests.beamline.array_source import ArraySource
 from tests.recon.prep.balls import Balls
@@ -37,7 +38,7 @@ def told(
 ) -> list[Finding]:
     source = ArraySource(data, [0] * len(data), angles)
     source.quantity = quantity
-    return list(views_first(source))
+    return list(views_first(ScanEvidence(source)))
 
 
 @pytest.mark.parametrize("turn", [np.pi, 2 * np.pi])

@@ -19,6 +19,7 @@ from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.stacks import FrameStack, StacksSource
 from beamline.storage.rules import Finding
 from beamline.storage.rules.angles import angles_spread, half_turn_unseen
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.closable import Closable
@@ -222,7 +223,7 @@ def test_angles_of_any_plan_are_no_counts_and_no_radians(
     )  # fmt: skip
     turns = min(turns, views / 2 if order == "even" else 1.0)  # no stage turns on by whole turns
     source.table.angles[:] = np.radians(start + sign * 360 * turns * share)
-    assert all(hit.severity != "error" for hit in angles_spread(source))
+    assert all(hit.severity != "error" for hit in angles_spread(ScanEvidence(source)))
 
 
 def test_float_frames_that_are_all_nan(tmp_path: Path) -> None:
@@ -241,7 +242,7 @@ def test_a_growing_file_can_be_validated(writer: NXtomoWriter, tmp_path: Path, f
 
 def test_the_beamless_scan_is_refused(shared_data: Path) -> None:
     with open_scan(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx") as source:
-        blockers = [found for found in source_findings(source) if found.severity == "error"]
+        blockers = [found for found in source_findings(ScanEvidence(source)) if found.severity == "error"]
     assert [finding.rule for finding in blockers] == ["bad-references"]
     assert "must not be reconstructed" in blockers[0].message
     assert describe(shared_data / "fixtures" / "esrf_bm05_nxtomo_20x16x16.nx")["reconstructable"] is False
@@ -255,7 +256,7 @@ def test_real_scans_can_be_reconstructed(shared_data: Path) -> None:
         ("walnut_parallel_rebinned_240x96x256.h5", {"quantity": "line_integrals"}),
     ):
         with open_scan(SourceOptions(shared_data / name, **how)) as source:  # type: ignore[arg-type]
-            assert all(found.severity != "error" for found in source_findings(source)), name
+            assert all(found.severity != "error" for found in source_findings(ScanEvidence(source))), name
             assert source.table.views.size >= 91
 
 

@@ -11,6 +11,7 @@ import torch
 
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel, RayModel, Truncation
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, Cpu, backend_for
@@ -31,7 +32,7 @@ def _fit(
     rng = np.random.default_rng(5)
     data = rng.random((geometry.n_views, *geometry.detector_shape)).astype(np.float32)
     weights = (rng.random(data.shape) > 0.1).astype(np.float32)
-    problem = fit.problem_of(data, geometry, Grid.matching(geometry), UNIT, settings, backend, weights)
+    problem = fit.problem_of(Views(data, geometry, weights), Grid.matching(geometry), UNIT, settings, backend)
     state, records = fit.init(g, 11, 1.5, backend), []
     run_steps(
         state, problem, settings, 3, lambda s: records.append((s.n, float(s.loss), float(s.residual))) is not None

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting import optimise as fit
 from recon.splatting.backend import backend_for
@@ -33,7 +34,7 @@ def _start(side: int = 24, n: int = 60, wide: float = 0.5) -> tuple[fit.FitState
     model = Gaussians.from_physical(
         (rng.random((n, 3)) - 0.5) * 0.8 * side, np.full((n, 3), wide), rng.uniform(0.2, 1, n), density_unit=UNIT
     )
-    problem = fit.problem_of(data, geometry, Grid.matching(geometry), UNIT, SETTINGS, backend)
+    problem = fit.problem_of(Views(data, geometry), Grid.matching(geometry), UNIT, SETTINGS, backend)
     return fit.init(model, 4, backend=backend), problem
 
 

@@ -17,6 +17,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanPart
 from beamline.projections.selection import Selection
 from beamline.projections.step import NamedStep
+from beamline.projections.views import evidence_of
 from recon.features.phase import FilterLength
 from recon.prep.correct import Projections, merge_and_empty
 from tests.beamline.array_source import ArraySource, counted
@@ -34,7 +35,7 @@ def _source() -> ArraySource:
 
 
 def _correction(selection: Selection) -> ScanCorrection:
-    return ScanCorrection(_source(), selection, pytest.fail)
+    return ScanCorrection(evidence_of(_source(), selection), selection.of(_source()), pytest.fail)
 
 
 def test_batches_and_views_on_disk_are_the_views_at_once() -> None:
@@ -63,13 +64,13 @@ def test_some_rows_are_those_of_the_whole_frame(binning: int) -> None:
 def test_what_the_file_does_not_say_is_asked_for() -> None:
     source = _source()
     with pytest.raises(ConfigError, match="--phase needs --distance-mm and --energy-kev"):
-        Phase("20").filter_of(source, SELECTION)
+        Phase("20").filter_of(source, SELECTION.of(source))
     source.facts, source.energy_kev = {"distance_mm": 50.0}, 20.0
-    found, said = Phase("20").filter_of(source, SELECTION)
-    assert found == PHASE.filter_of(source, SELECTION)[0]
+    found, said = Phase("20").filter_of(source, SELECTION.of(source))
+    assert found == PHASE.filter_of(source, SELECTION.of(source))[0]
     assert "delta/beta 20 at 20 keV, 50 mm behind" in said
     with pytest.raises(ConfigError, match=r"has 48 x 40"):
-        replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION)
+        replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION.of(source))
     with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
         _correction(SELECTION.with_steps(Preparation(noise="counts")))
 
@@ -77,9 +78,9 @@ def test_what_the_file_does_not_say_is_asked_for() -> None:
 def test_a_cone_is_scaled_to_the_sample() -> None:
     source = _source()
     source.cone = (10.0, 40.0)
-    found, said = replace(PHASE, distance_mm=None).filter_of(source, SELECTION)
+    found, said = replace(PHASE, distance_mm=None).filter_of(source, SELECTION.of(source))
     near = replace(SELECTION, pixel_size_mm=0.25e-3)
-    plane, _ = replace(PHASE, distance_mm=7.5).filter_of(_source(), near)
+    plane, _ = replace(PHASE, distance_mm=7.5).filter_of(_source(), near.of(_source()))
     assert "30 mm behind" in said and found.length == pytest.approx(plane.length)
 
 
@@ -141,10 +142,10 @@ def test_a_filter_that_explains_little_is_told_of_and_not_applied(monkeypatch: p
 def test_the_search_takes_no_more_memory_than_it_states() -> None:
     source = _rimmed(0.8)
     views, geometry = views_of_can(0.8)
-    part = ScanPart(source, Selection(), geometry)
+    part = ScanPart(source, Selection().of(source), geometry)
     masked = np.zeros(views.shape[1:], np.bool_)
     given = Projections(views, np.arange(len(views)), 0.0, np.ones(len(views), np.float32), masked)
-    taken = peak(lambda: Phase().estimated(source, Selection(), given, geometry))
+    taken = peak(lambda: Phase().estimated(source, part.selection, given, geometry))
     assert 0.25 * Phase().memory(part).alone < taken < Phase().memory(part).alone
 
 

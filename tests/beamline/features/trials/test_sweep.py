@@ -4,40 +4,37 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from beamline.features.sweeps import sweep
-from beamline.features.sweeps.command import sweepable
-from beamline.features.sweeps.sweep import SweptSlice, scores_of
-from beamline.features.sweeps.values import swept_option
-from beamline.projections.prepared import PreparedProjections
+from beamline.features.trials import run_trial
+from beamline.features.trials.sweep import UnseenViews, scores_of, shares_of
+from beamline.features.trials.sweep_command import sweepable, swept_option
 from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 from recon.voxels.resolution import ViewResolution, at_voxel_resolution
 from tests.beamline.cli.small_scan import SCAN, beamline, left
-from tests.beamline.prepared_views import prepared_views
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PNG = b"\x89PNG"
 
 
-def _table(path: str = "scan_sweep.csv") -> list[dict[str, str]]:
-    with Path(path).open(encoding="utf-8", newline="") as file:
+def _table(folder: str = "scan_sweep") -> list[dict[str, str]]:
+    with (Path(folder) / "sweep.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
 def test_the_score_is_what_a_volume_leaves_of_views_that_it_has_not_seen(folder: Path) -> None:
     result = beamline("sweep", "scan.h5", "filter=ram-lak,hann", "--axis", "20.7", "--air", "none", "--json")
     assert result.exit_code == 0, result.output
-    assert left(folder) == {"scan.h5", "scan_sweep.png", "scan_sweep.csv"}
-    assert Path("scan_sweep.png").read_bytes().startswith(PNG)
+    assert left(folder) == {"scan.h5", "scan_sweep"}
+    assert left(folder / "scan_sweep") == {"sweep.csv", "report.html", "slices.png", "quality.png"}
+    assert Path("scan_sweep/slices.png").read_bytes().startswith(PNG)
     done = json.loads(result.stdout.splitlines()[-1])
     expected = {}
     lines = SCAN.line_integrals().astype(np.float32)[:, :1]
@@ -61,18 +58,18 @@ def test_the_axis_is_found_by_slices_of_fbp(folder: Path) -> None:
     result = beamline("sweep", "scan.h5", "axis=17.2:24.2:0.5", "--json")
     done = json.loads(result.stdout.splitlines()[-1])
     assert float(done["best"]["axis"]) == pytest.approx(SCAN.axis_col, abs=0.01), result.stderr
-    result = beamline("sweep", "scan.h5", "axis=30:50:5", "-o", "outside.png")
+    result = beamline("sweep", "scan.h5", "axis=30:50:5", "-o", "outside")
     assert result.exit_code == 2 and "outside the detector" in result.stderr
 
 
 def test_a_grid_of_two_options_finds_the_axis_with_a_method_that_explains_views(folder: Path) -> None:
-    given = ("sweep", "scan.h5", "axis=19.7:21.7:1", "iterations=5,15", "-m", "sirt", "-o", "grid.png")
+    given = ("sweep", "scan.h5", "axis=19.7:21.7:1", "iterations=5,15", "-m", "sirt", "-o", "grid")
     result = beamline(*given)
     assert result.exit_code == 0, result.output
-    verdicts = {(row["axis"], row["iterations"]): row["verdict"] for row in _table("grid.csv")}
+    verdicts = {(row["axis"], row["iterations"]): row["verdict"] for row in _table("grid")}
     assert [at for at, verdict in verdicts.items() if verdict == "best"] == [("20.7", "15")]
     assert "beamline recon scan.h5 -m sirt --axis=20.7 --iterations=15" in result.stderr
-    assert "The best iterations" not in result.stderr
+    assert "The best iterations" not in result.stdout and "axis 20.7, iterations 15" in result.stdout
 
 
 @pytest.mark.parametrize(
@@ -87,7 +84,7 @@ def test_a_grid_of_two_options_finds_the_axis_with_a_method_that_explains_views(
         ("scan.h5 rings=none,vo --rings vo", "--rings is swept"),
         ("scan.h5 rings=none,vo --truth t.npz", "--truth belongs to a volume"),
         ("scan.h5 allow-negative=no,yes -m sirt", "expected allow-negative=false,true"),
-        ("scan.h5 rings=none,vo -o sheet.pdf", "give a name such as sheet.png"),
+        ("scan.h5 rings=none,vo -o scan.h5", "scan.h5"),
     ],
 )
 def test_nonsense_is_refused_at_once(folder: Path, words: str, why: str) -> None:
@@ -100,47 +97,71 @@ def test_nonsense_is_refused_at_once(folder: Path, words: str, why: str) -> None
 def test_an_interrupt_keeps_the_slices_that_are_done(
     folder: Path, monkeypatch: pytest.MonkeyPatch, slices: int
 ) -> None:
-    original, calls = sweep.swept_slice, iter(range(9))
+    original, calls = vars(run_trial)["run_on"], iter(range(9))
 
     def interrupted(*args: Any) -> Any:
         if next(calls) == slices:
             raise KeyboardInterrupt
         return original(*args)
 
-    monkeypatch.setattr(sweep, "swept_slice", interrupted)
+    monkeypatch.setattr(run_trial, "run_on", interrupted)
     result = beamline("sweep", "scan.h5", "filter=hann,ram-lak,shepp-logan")
     if not slices:
         assert result.exit_code == 130 and left(folder) == {"scan.h5"}
         return
-    assert result.exit_code == 4 and "after 2 of 3 slices" in result.stderr
-    assert [row["filter"] for row in _table()] == ["hann", "ram-lak"]
+    assert result.exit_code == 4 and "after 2 of 3 trials" in result.stderr
+    assert [row["status"] for row in _table()] == ["done", "done", "interrupted"]
 
 
-def _slice(name: str, image: float, views: PreparedProjections) -> SweptSlice:
-    projected = np.full((2, 1, 4), image, np.float32)
-    resolution = ViewResolution.of(views.geometry, Grid.matching(views.geometry))
-    return SweptSlice({"rings": name}, np.zeros((2, 2), np.float32), 0.0, views, projected, resolution)
+def test_values_that_change_pixels_have_no_score(folder: Path) -> None:
+    result = beamline("sweep", "scan.h5", "bin=1,2", "--axis", "20.7")
+    assert result.exit_code == 0 and "No score: the values change pixels" in result.stdout
+    assert [(row["status"], row["residual_held_out"], row["verdict"]) for row in _table()] == [("done", "", "")] * 2
+    assert Path("scan_sweep/slices.png").read_bytes().startswith(PNG)
 
 
-def _views(value: float, ids: tuple[int, int] = (1, 5)) -> PreparedProjections:
+def _unseen(model: float, value: float, ids: tuple[int, int] = (1, 5), views: str = "") -> UnseenViews:
+    """A volume that shows so much in views held out of this value."""
     geometry = Geometry.parallel(np.array([0.0, 1.0]), (1, 4), axis_col=1.5, pixel_pitch=1.0)
-    lines = np.full((2, 1, 4), value, np.float32)
-    return prepared_views(lines, geometry, held_out=(lines, geometry), held_out_ids=np.array(ids))
+    data, shown = (np.full((2, 4, 1), each, np.float32) for each in (value, model))
+    resolution = ViewResolution.of(geometry, Grid.matching(geometry))
+    return UnseenViews(np.array(ids), data, shown, resolution, views)
 
 
 def test_a_correction_that_agrees_with_itself_alone_does_not_win() -> None:
     """Two of three corrections give views of 1, and the third, which takes half of them away, predicts its own best."""
-    ones, half = _views(1.0), _views(0.5)
-    scores = scores_of([_slice("a", 1.02, ones), _slice("b", 1.01, replace(ones)), _slice("c", 0.5, half)])
-    assert scores is not None and not scores.same_views
-    assert scores.shares == pytest.approx(np.array([2 * 0.02 + 0.52, 2 * 0.01 + 0.51, 2 * 0.5 + 0.0]) / 2.5, rel=1e-5)
-    assert scores.best == 1
+    views = {"a": _unseen(1.02, 1.0, views="a"), "b": _unseen(1.01, 1.0, views="b"), "c": _unseen(0.5, 0.5, views="c")}
+    scores = scores_of(views)
+    assert scores is not None and not scores[1]
+    assert shares_of(scores[0]) == pytest.approx([0.56 / 2.5, 0.53 / 2.5, 1.0 / 2.5], rel=1e-5)
+    assert scores[0].verdicts == ["", "best", ""]
 
 
 def test_only_views_that_no_slice_has_learnt_from_count() -> None:
-    scores = scores_of([_slice("a", 1.5, _views(1.0)), _slice("b", 1.2, _views(1.0, (5, 9)))])
-    assert scores is not None and scores.residuals.shape == (2, 1) and scores.same_views
-    assert scores_of([_slice("a", 1.5, _views(1.0)), _slice("b", 1.2, _views(1.0, (7, 9)))]) is None
+    scores = scores_of({"a": _unseen(1.5, 1.0), "b": _unseen(1.2, 1.0, (5, 9), "b")})
+    assert scores is not None and len(scores[0].predictions[0].residuals or ()) == 1 and scores[1]
+    assert scores_of({"a": _unseen(1.5, 1.0), "b": _unseen(1.2, 1.0, (7, 9), "b")}) is None
+
+
+def test_a_value_whose_method_fails_is_a_row_and_the_others_are_made(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original, calls = vars(run_trial)["run_on"], iter(range(9))
+
+    def failing(*args: Any) -> Any:
+        if next(calls) == 1:
+            raise ValueError("no matter")
+        return original(*args)
+
+    monkeypatch.setattr(run_trial, "run_on", failing)
+    result = beamline("sweep", "scan.h5", "filter=hann,ram-lak,shepp-logan", "--json")
+    assert result.exit_code == 0, result.output
+    assert [(row["status"], row["message"]) for row in _table()] == [
+        ("done", ""),
+        ("failed", "no matter"),
+        ("done", ""),
+    ]
+    assert len(json.loads(result.stdout.splitlines()[-1])["scores"]) == 2
 
 
 LEGAL = ("tv-weight", "rings", "axis")

@@ -1,0 +1,292 @@
+"""Sweep: the same slice with each value of one or two options, and how well each volume predicts views held out."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+
+from beamline.core.errors import DataError
+from beamline.core.events import Sink
+from beamline.core.machine import machine
+from beamline.core.sinks import Warnings
+from beamline.core.text import NUMBER
+from beamline.features.trials.run_trial import TrialRun, TrialScan
+from beamline.features.trials.runner import Planned
+from beamline.features.trials.trial import HELD_OUT, MethodTrial, Outcome, TrialTable
+from beamline.projections.prepare import prepare_projections
+from beamline.projections.prepared import PreparedProjections, hold_out
+from beamline.projections.selection import Selection
+from beamline.reconstruct.job import compile_kernels
+from beamline.reconstruct.options import ReconOptions
+from beamline.reconstruct.scan_facts import facts_of
+from beamline.report.sheets import COLUMNS, SliceSheet
+from drivers.base.clock import Clock
+from recon.base.arrays import F32, I64
+from recon.base.empirical import ONE_IN
+from recon.base.volume import Grid, Volume
+from recon.methods import BASELINE
+from recon.voxels.choice import Prediction, TrialChoice
+from recon.voxels.projector import Projector, projection_lines
+from recon.voxels.residuals import squares_left
+from recon.voxels.resolution import ViewResolution
+
+_FLAT = 0.05  # share by which the residual of a direct method must change: one of 0.03 named an axis 0.7 columns off
+_NUMBER = re.compile(rf"[-+]?{NUMBER}")
+_NO_SCORE = "No score: the values change pixels or views, so the slices cannot be compared with the same views."
+_OTHER_VIEWS = (
+    "These values change the views that judge the slices: each is compared with the views of every value, which "
+    "favours the middle of a range. Look at the pictures first."
+)
+_TALLEST = 16  # rows of a slab around the slice, as of trials of a method
+
+
+@dataclass(frozen=True)
+class SweptTrial(MethodTrial):
+    """A reconstruction with one value of each option.
+
+    Attributes:
+        settings: the values, by the name of the option.
+        options: of `beamline recon`.
+    """
+
+    options: ReconOptions = field(kw_only=True, hash=False)
+
+    @property
+    def label(self) -> str:
+        """The options and their values."""
+        return ", ".join(f"{name} {value}" for name, value in self.settings.items())
+
+    @property
+    def shown(self) -> str:
+        """The label: every slice is shown."""
+        return self.label
+
+
+class UnseenViews(NamedTuple):
+    """The views held out from a trial, and what its volume shows in them.
+
+    Attributes:
+        ids: rows of the file.
+        data: [view, col, row], as the trial corrects them; pixels that were not measured are NaN.
+        model: [view, col, row] what the volume shows at this resolution.
+        views: those that the trial used; trials with the same ones have the same data.
+    """
+
+    ids: I64
+    data: F32
+    model: F32
+    resolution: ViewResolution
+    views: object
+
+    def of(self, ids: I64) -> UnseenViews:
+        """Those with these rows of the file."""
+        at = np.searchsorted(self.ids, ids)
+        return UnseenViews(ids, self.data[at], self.model[at], self.resolution.select(at), self.views)
+
+
+def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
+    """The same reconstruction options for a few rows around the middle.
+
+    A direct method needs the row of the slice alone, total variation and fits some beside it. Of a cone, and where rows
+    are given, all of them are made.
+
+    Raises:
+        ConfigError, DataError: a scan or a selection that is refused.
+    """
+    halo = max(min(trial.method.halo, (_TALLEST - 1) // 2) for trial in trials)
+    return [replace(trial, selection=_middle(trial, halo)) for trial in trials]
+
+
+def _middle(trial: ReconOptions, halo: int) -> Selection:
+    selection = trial.selection
+    with trial.source.open() as source:
+        part, n = selection.of(source), selection.binning
+    if selection.rows is not None or part.cone is not None:
+        return selection
+    rows = part.detector_rows
+    height = min(2 * halo + 1, (rows.stop - rows.start) // n) * n
+    first = rows.start + (rows.stop - rows.start - height) // 2
+    return replace(selection, rows=(first, first + height), axis_rows=selection.axis_rows or (rows.start, rows.stop))
+
+
+class SweptScan(TrialScan):
+    """The scan of a sweep. Views are corrected once for all values that do not affect the correction.
+
+    The rotation axis is found once, so that slices differ by the options alone; where it is swept, views are corrected
+    about the axis in the middle.
+
+    Attributes:
+        unseen: of the trials that were made, by label.
+    """
+
+    def __init__(self, trials: Sequence[SweptTrial], sink: Sink, clock: Clock) -> None:
+        self._trials, self._sink, self._clock = trials, sink, clock
+        self._first = repr(trials[0].options.source)
+        self._axis = middle_axis([trial.options.selection for trial in trials])
+        self._of_axes = self._axis is not None
+        self._views: tuple[str, Selection, PreparedProjections] | None = None
+        self._used: PreparedProjections | None = None
+        self.unseen: dict[str, UnseenViews] = {}
+
+    def asked_by(self, trial: MethodTrial) -> TrialRun:
+        """What a trial runs. Raises ConfigError, DataError: see `beamline recon`."""
+        assert isinstance(trial, SweptTrial)
+        options, asked = trial.options, trial.options.selection
+        views = self._corrected(options)
+        self._used = views if asked.axis_col is None or not self._of_axes else _about(views, asked)
+        compile_kernels(options, self._used.geometry, self._sink, self._clock)
+        method, grid = options.method_for(self._used.geometry), Grid.matching(views.geometry)
+        return TrialRun(method, self._used, grid, options.seed, options.device)
+
+    def _corrected(self, options: ReconOptions) -> PreparedProjections:
+        asked, source_words = options.selection, repr(options.source)
+        its_own = not self._of_axes and (asked.axis_col is not None or source_words != self._first)
+        wanted = asked if its_own else replace(asked, axis_col=self._axis)
+        if self._views is None or self._views[:2] != (source_words, wanted):
+            with options.source.open() as source:
+                views = prepare_projections(source, wanted, Warnings(self._sink, self._clock))
+            views = hold_out(views, ONE_IN, advice="take a scan with more views")
+            if wanted.axis_col is None and source_words == self._first:
+                self._axis = views.axis_col
+                wanted = replace(wanted, axis_col=self._axis)
+            self._views = source_words, wanted, views
+        return self._views[2]
+
+    def measured(self, trial: MethodTrial, made: Volume) -> tuple[Mapping[str, float], Sequence[float]]:
+        """The residual of the views held out, as this trial corrects them, and its square in each."""
+        used = self._used
+        assert used is not None and used.held_out is not None and used.held_out_ids is not None and self._views
+        projector, data = Projector(used.held_out[1], made.grid), used.held_out[0]
+        data = data if used.measured is None else np.where(used.measured, data, np.float32(np.nan))
+        model = projector.forward(np.asarray(made.data))
+        unseen = UnseenViews(
+            used.held_out_ids, projection_lines(data), projection_lines(model), projector.resolution, self._views[2]
+        )
+        self.unseen[trial.label] = unseen
+        left = squares_left(unseen.model, unseen.data, None, unseen.resolution)
+        return {HELD_OUT: left.residual}, left.left.tolist()
+
+    def concluded(self, table: TrialTable) -> TrialTable:
+        """The table with scores in place of residuals by each trial's own views, with verdicts and remarks.
+
+        Raises:
+            DataError: no slice was made, or the views held out show nothing.
+        """
+        if not table.compared:
+            raise DataError(f"No slice was made, the first because {table.outcomes[0].message}.")
+        direct = not self._trials[0].options.method.fitted
+        if (scores := scores_of(self.unseen, direct=direct)) is None:
+            outcomes = [replace(outcome, metrics={}) for outcome in table.outcomes]
+            return replace(table, outcomes=tuple(outcomes), notes=[_NO_SCORE])
+        choice, same_views = scores
+        judged = {each.name: (share, verdict) for each, share, verdict in zip(
+            choice.predictions, shares_of(choice), choice.verdicts, strict=True
+        )}  # fmt: skip
+        for at in table.todo:
+            if (label := table.outcomes[at].trial.label) in judged:
+                share, verdict = judged[label]
+                metrics = {HELD_OUT: share}
+                table = table.with_outcome(at, replace(table.outcomes[at], verdict=verdict, metrics=metrics))
+        notes = [f"{BASELINE} leaves mostly the blur of its filter; -m fista-tv tells values apart better."] * direct
+        notes += [] if same_views else [_OTHER_VIEWS]
+        if (best := table.best) is None:
+            low, high = min(shares_of(choice)), max(shares_of(choice))
+            best, nearly = {}, f"All scores are nearly the same ({low:.4g} to {high:.4g}): they name no value."
+            notes.append(nearly)
+        for name in best if same_views else ():
+            tried = list(dict.fromkeys(trial.settings[name] for trial in self._trials))
+            if len(tried) > 2 and best[name] in (tried[0], tried[-1]) and all(_NUMBER.fullmatch(str(v)) for v in tried):
+                notes.append(f"The best {name} is at the end of the range, {best[name]}: try further.")
+        return replace(table, notes=notes)
+
+
+def middle_axis(selections: Sequence[Selection]) -> float | None:
+    """The axis used to correct all views if the axis itself is swept; None if it is not.
+
+    Corrections look at views on both sides of the axis: with each its own, some would correct and others not.
+    """
+    axes = sorted(each.axis_col for each in selections if each.axis_col is not None)
+    return axes[len(axes) // 2] if len(axes) == len(selections) and axes[0] < axes[-1] else None
+
+
+def _about(prepared: PreparedProjections, selection: Selection) -> PreparedProjections:
+    """The same views about the axis of the selection."""
+    assert prepared.held_out is not None and selection.axis_col is not None
+    data, unseen = prepared.held_out
+    n = selection.binning
+    axis_col = (selection.axis_col - (n - 1) / 2) / n
+    return replace(
+        prepared,
+        geometry=replace(prepared.geometry, axis_col=axis_col),
+        axis_col=selection.axis_col,
+        held_out=(data, replace(unseen, axis_col=axis_col)),
+    )
+
+
+def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tuple[TrialChoice, bool] | None:
+    """How well each slice's volume predicts views held out, as shares of these; and whether all options give the same
+    views. None if slices differ in pixels, or in their views held out.
+
+    A correction changes these views, too: one that smooths would be judged by smoother views. So each volume is
+    compared with them as every value corrects them, and the mean counts.
+
+    Args:
+        direct: the volumes are of a direct method, which leaves mostly the blur of its filter.
+
+    Raises:
+        DataError: the views held out show nothing.
+    """
+    common = reduce(np.intersect1d, (each.ids for each in slices.values()))
+    if len({each.model.shape[1:] for each in slices.values()}) > 1 or not common.size:
+        return None
+    unseen = [each.of(common) for each in slices.values()]
+    judges = {id(each.views): each for each in reversed(unseen)}.values()  # one resolution for all geometries
+    if not all(np.isfinite(judge.data).any(axis=(1, 2)).all() for judge in judges):
+        return None
+    same = all(np.array_equal(judge.data, unseen[0].data, equal_nan=True) for judge in judges)
+    sums = [[squares_left(each.model, judge.data, None, judge.resolution) for judge in judges] for each in unseen]
+    scale = sum(math.sqrt(of.own.mean()) for of in sums[0])
+    if scale == 0:
+        raise DataError("The views held out show nothing: there is nothing to compare the slices with.")
+    residuals = [np.sum([np.sqrt(of.left) for of in row], axis=0) / scale for row in sums]
+    predictions = (Prediction(name, left.tolist()) for name, left in zip(slices, residuals, strict=True))
+    return TrialChoice(f"{len(common)} views", _FLAT if direct else 0.0, tuple(predictions)), same
+
+
+def shares_of(choice: TrialChoice) -> list[float]:
+    """[candidate] the residual of all views held out, as in `recon.judgement`."""
+    return [float(np.sqrt(np.square(left).mean())) for left in choice.tried.values()]
+
+
+Trials = Sequence[tuple[Mapping[str, str], ReconOptions]]
+"""Values by option, and the options of `beamline recon` with these."""
+
+
+def planned_sweep(trials: Trials, command: str, sink: Sink, clock: Clock) -> Planned:
+    """Cut the rows of the slice, and plan a trial for each combination of values.
+
+    Raises:
+        ConfigError, DataError: nothing was written.
+    """
+    (first, options), *_ = trials
+    swept = [
+        SweptTrial("option", each.method.name, 0, values, options=each)
+        for (values, _), each in zip(trials, sliced([each for _, each in trials]), strict=True)
+    ]
+    with options.source.open() as source:
+        facts = dict(facts_of(source).table)
+    rows = swept[0].options.selection.rows
+    facts["row"] = "the middle one" if rows is None else str(sum(rows) // 2)
+    across = len({values[[*first][1]] for values, _ in trials}) if len(first) > 1 else min(COLUMNS, len(trials))
+    table = TrialTable(
+        "sweep", f"{' and '.join(first)} of a slice", tuple(Outcome(each, "not run") for each in swept), HELD_OUT,
+        machine(), facts, command, f"Which {' and '.join(first)} predicts views held out best?", asks_best=True,
+    )  # fmt: skip
+    scan = SweptScan(swept, sink, clock)
+    return Planned(lambda run: scan, table, SliceSheet(across=across, closer=True))

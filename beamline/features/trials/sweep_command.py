@@ -1,0 +1,209 @@
+"""`beamline sweep`: one slice with each value of an option of `beamline recon`, as a sheet with scores."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import shlex
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from decimal import Decimal
+from functools import partial
+from pathlib import Path
+from tempfile import gettempdir
+from typing import TYPE_CHECKING
+
+import click
+
+from beamline.cli.options import Declared, json_option, name_of, new_folder_option
+from beamline.cli.recipe import names_given
+from beamline.cli.recon import options_of, recon
+from beamline.core.text import NUMBER, safe_name
+from recon.base.registry import did_you_mean
+from recon.methods import BASELINE
+
+if TYPE_CHECKING:
+    from beamline.reconstruct.options import ReconOptions
+
+_OF_A_VOLUME = frozenset(
+    ("output", "report", "write-config", "json", "dry-run", "max-residual", "truth", "uncertainty",
+     "roi", "follow", "earlier", "memory", "cluster", "checkpoint", "resume", "budget",
+     "time", "moves", "beside-scan")
+)  # fmt: skip
+"""Options of `beamline recon` that a slice has no use for."""
+
+MOST = 64
+"""Slices of a sheet."""
+_AXIS = "center", "centre", "center-of-rotation", "centre-of-rotation", "cor", "rotation-axis"  # to other programs
+_SIGNED = rf"[-+]?{NUMBER}"
+_RANGE = re.compile(rf"({_SIGNED}):({_SIGNED}):({_SIGNED})")
+
+
+@dataclass(frozen=True)
+class SweptOption:
+    """An option and the values to try, as they are typed.
+
+    Attributes:
+        name: long name, without dashes.
+    """
+
+    name: str
+    values: tuple[str, ...]
+
+
+def swept_option(text: str, legal: Collection[str]) -> SweptOption:
+    """The option and values of NAME=A:B:STEP or NAME=a,b,c.
+
+    Args:
+        legal: long names of options that can be swept; "_" in a name stands for "-".
+
+    Raises:
+        ValueError: another name, with the nearest one, or no values.
+    """
+    name, equals, values = text.partition("=")
+    name = name.strip().lstrip("-").replace("_", "-")
+    if not equals:
+        raise ValueError(f"{text!r} is no option with values; expected NAME=A:B:STEP or NAME=a,b,c")
+    if name not in legal:
+        near = " (did you mean axis?)" if name in _AXIS else did_you_mean(name, legal)
+        raise ValueError(
+            f"{name!r} cannot be swept{near}; options of `beamline recon --help-all` under Data, Corrections and "
+            "Method can be swept, such as tv-weight, rings or axis"
+        )
+    tried = _values(name, values)
+    if len(tried) < 2:
+        one = f"; a single one is `beamline recon --{name} {tried[0]}`" if tried else ""
+        raise ValueError(
+            f"a sweep takes at least two values, as NAME=A:B:STEP or NAME=a,b,c, and {text!r} has {len(tried)}{one}"
+        )
+    return SweptOption(name, tried)
+
+
+def _values(name: str, text: str) -> tuple[str, ...]:
+    match = _RANGE.fullmatch(text.strip())
+    if match is None:
+        return tuple(dict.fromkeys(value for value in (word.strip() for word in text.split(",")) if value))
+    first, last, step = map(Decimal, match.groups())
+    if step == 0 or (last - first) / step <= 0:
+        raise ValueError(f"{name}={text}: a STEP of {step} does not lead from {first} to {last}")
+    steps = int((last - first) / step)
+    if steps >= MOST:
+        raise ValueError(f"{name}={text} has {steps + 1} values, more than {MOST}: give a larger STEP")
+    return tuple(f"{first + n * step:f}" for n in range(steps + 1))
+
+
+def combinations(options: Sequence[SweptOption]) -> list[Mapping[str, str]]:
+    """All combinations of values, by name; the last option varies fastest.
+
+    Raises:
+        ValueError: not one or two different options, or too many combinations.
+    """
+    names = [option.name for option in options]
+    if not 1 <= len(names) <= 2 or len(set(names)) < len(names):
+        raise ValueError(f"{len(names)} options are given ({', '.join(names) or 'none'}); expected one, or two others")
+    combined: list[Mapping[str, str]] = [
+        dict(zip(names, values, strict=True)) for values in itertools.product(*(option.values for option in options))
+    ]
+    if len(combined) > MOST:
+        raise ValueError(f"{len(combined)} combinations are more than {MOST}: give fewer values")
+    return combined
+
+
+Trials = list[tuple[Mapping[str, str], "ReconOptions"]]
+
+
+def sweepable() -> dict[str, click.Option]:
+    """The options of `beamline recon` that may have several values, by long name."""
+    own = {name_of(param): param for param in recon.params if isinstance(param, click.Option)}
+    of_one_call = {name for name, param in own.items() if isinstance(param, Declared) and param.of_one_call}
+    return {name: own[name] for name in sorted(own.keys() - _OF_A_VOLUME - of_one_call)}
+
+
+@click.command(context_settings={"ignore_unknown_options": True, "help_option_names": ["-h", "--help"]})
+@click.argument("words", nargs=-1, type=click.UNPROCESSED, metavar="FILE|RUN NAME=VALUES [NAME=VALUES]")
+@new_folder_option("FILE's stem + _sweep")
+@json_option
+def sweep(words: tuple[str, ...], output: Path | None, as_json: bool) -> None:
+    """Reconstruct one slice of the scan in FILE with each value of an option of `beamline recon`, and draw them.
+
+    NAME is the long name of the option; VALUES are A:B:STEP or a,b,c: tv-weight=0.5:4:0.5, rings=none,sort,vo,
+    axis=84:88:0.5. Two options make a grid. All other options of `beamline recon` hold for every slice; the method is
+    fbp without -m.
+
+    One of eight views is held out, and each volume is judged by what it leaves of these. The best is marked, and those
+    that chance does not tell from it. The middle row is shown, of the rows that the method needs around it, or of
+    --rows. Writes a folder with sweep.csv, pictures and report.html. Ctrl-C keeps the slices that are done (exit code
+    4; 130 and no folder before the first).
+    """
+    from beamline.features.trials.runner import compare
+    from beamline.features.trials.sweep import planned_sweep
+
+    options, common = _parsed(words)
+    trials = _trials(options, common)
+    file = trials[0][1].source.path
+    folder = output or Path(f"{safe_name(Path(file).stem)}_sweep")
+    plan = partial(planned_sweep, trials, shlex.join(["beamline", "sweep", *words]))
+    table = compare(plan, file, folder, as_json=as_json)
+    if not as_json and table.best is not None:
+        again = [word for name, value in table.best.items() for word in _as_words(name, str(value))]
+        click.echo(f"If the pictures agree: {shlex.join(['beamline', 'recon', *common, *again])}", err=True)
+
+
+def _parsed(words: Sequence[str]) -> tuple[list[SweptOption], list[str]]:
+    """The options with their values, and the words of `beamline recon` that are the same for all, its scan first."""
+    with click.Context(recon, info_name="sweep") as context:
+        taken, further, _ = recon.make_parser(context).parse_args(list(words))
+    if (file := taken.get("file")) is None or not further:
+        raise click.UsageError("give a scan, and an option with its values, such as tv-weight=0.5:4:0.5.")
+    rest = list(words)
+    for word in (str(file), *further):
+        rest.remove(word)
+    try:
+        options = [swept_option(word, sweepable()) for word in further]
+        combinations(options)
+    except ValueError as error:
+        raise click.UsageError(f"{error}.") from error
+    return options, [str(file), *rest]
+
+
+def _as_words(name: str, value: str) -> list[str]:
+    """An option with a value, as `beamline recon` takes it. UsageError: a flag that is neither on nor off."""
+    switch = sweepable()[name]
+    if not switch.is_flag:
+        return [f"--{name}={value}"]
+    if value not in ("true", "false"):
+        raise click.UsageError(f"{name}={value}: it is on or off; expected {name}=false,true.")
+    names = switch.opts if value == "true" else switch.secondary_opts
+    return [max(names, key=len)] if names else []
+
+
+def _trials(options: Sequence[SweptOption], common: Sequence[str]) -> Trials:
+    """Each combination of values with the options of its reconstruction. UsageError: values that are not taken, or that
+    change nothing."""
+    trials: Trials = []
+    for values in combinations(options):
+        own = [word for item in values.items() for word in _as_words(*item)]
+        with recon.make_context("sweep", [*common, *own]) as context:
+            trials.append((values, _options(context)))
+        if len(trials) == 1:
+            with recon.make_context("sweep", list(common)) as alone:
+                twice = names_given(alone) & values.keys()
+            if twice:
+                raise click.UsageError(f"--{min(twice)} is swept: give its values once.")
+    told = [
+        (repr((each.source, each.selection, each.method)), each.quality, each.seed, each.device) for _, each in trials
+    ]
+    if all(each == told[0] for each in told[1:]):
+        names = " and ".join(option.name for option in options)
+        raise click.UsageError(f"{names} changes nothing of a slice by {trials[0][1].method.name}.")
+    return trials
+
+
+def _options(context: click.Context) -> ReconOptions:
+    """The options of one reconstruction, of which no volume is written."""
+    from beamline.reconstruct.options import OutputPaths
+
+    if foreign := sorted(names_given(context) & _OF_A_VOLUME):
+        raise click.UsageError(f"--{foreign[0]} belongs to a volume, and a sweep makes slices.")
+    target = OutputPaths(Path(gettempdir()) / "slice.h5", None, replace=True, written=False)
+    return replace(options_of(context, BASELINE), target=target)

@@ -1,0 +1,332 @@
+"""Evidence of a scan: what its references and some views show, computed once a job from frames read once, handed on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.flag import Finding
+from beamline.monitor.digest import block_means, check_block, is_valid, thinned
+from beamline.monitor.evidence import BRIGHT, DRIFT, LEAST_NOISE, Evidence, FrameStatistics, full_scale, lit_places
+from beamline.monitor.references import ReferenceLimits, judge
+from beamline.storage.flag_legend import FrameFlags
+from beamline.storage.frame_table import FrameTable
+from beamline.storage.readers.base import ScanSource, read_known
+from drivers.base.frame import FrameKind
+from recon.base.arrays import F32, F64, I64
+from recon.base.noise import deviation_between_neighbours
+from recon.base.views import spread
+from recon.prep.references import dark_at
+from recon.prep.unmeasured import with_borders_filled
+
+VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
+CELLS = 32  # across the frame, about, by which flats are compared with views
+WORST = 99.0  # percentile of the places of a view that counts, so that zingers do not
+EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
+LEAST = 0.01  # share of the light of the brightest views, in a view's own bright part: all matter leaves that much open
+_SUSPECT = 0.1  # share of the flats' light from which a view is not looked at more closely
+_ACROSS = 32  # pixels a side, about, by which a view is suspected
+_TAIL = 1.2816  # standard deviations: BRIGHT percent of noise are below
+
+
+class ReferenceGroups(NamedTuple):
+    """Rows of darks and of flats, by groups, in the order of the file."""
+
+    darks: tuple[I64, ...]
+    flats: tuple[I64, ...]
+
+
+class Asked(NamedTuple):
+    """What is asked of the evidence of a scan.
+
+    Attributes:
+        accepted: references are used as they are: their faults are warnings.
+        cone: mm from the source to the rotation axis and to the detector, in place of the file's.
+        judged: flags that count in place of the file's.
+        limits: of darks and flats; None: those of a new scan.
+    """
+
+    accepted: bool = False
+    cone: tuple[float, float] | None = None
+    judged: FrameFlags | None = None
+    limits: ReferenceLimits | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ScanEvidence:
+    """What the references and some views of a scan show, beside what its file states.
+
+    It is taken once a job and handed on; of a running scan, `renewed` goes on with the frames recorded by then. What is
+    asked for is computed once, and each frame that it needs is read once.
+
+    Attributes:
+        source: reads the frames.
+        table: what each frame was when the evidence was taken.
+    """
+
+    source: ScanSource
+    asked: Asked = field(default_factory=Asked)
+    table: FrameTable = field(init=False)
+    _seen: dict[int, FrameStatistics] = field(default_factory=dict)
+    _lit: dict[int, bool] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "table", self.source.table)
+
+    def renewed(self) -> ScanEvidence:
+        """The evidence with the frames that are recorded by now."""
+        return self if self.source.table is self.table else replace(self)
+
+    @property
+    def in_counts(self) -> bool:
+        """Whether pixels are counts, which references are for."""
+        return self.source.quantity == "counts"
+
+    @property
+    def cone(self) -> tuple[float, float] | None:
+        """mm from the source to the rotation axis and to the detector; None for a parallel beam."""
+        return self.source.cone if self.asked.cone is None else self.asked.cone
+
+    @property
+    def flags(self) -> FrameFlags | None:
+        """Flags of all frames, those that count; None: there are none."""
+        return self.table.flags if self.asked.judged is None else self.asked.judged
+
+    # References, by groups
+
+    @cached_property
+    def taken(self) -> ReferenceGroups:
+        """All groups of references, faulty ones included."""
+        return ReferenceGroups(*(groups_of(self.table, kind) for kind in (FrameKind.DARK, FrameKind.FLAT)))
+
+    @cached_property
+    def good(self) -> ReferenceGroups:
+        """The references without a fault; of a kind without a good one, all."""
+        bad = [row for each in self.findings if each.severity != "error" for row in each.frames]
+        kept = ((np.setdiff1d(group, bad) for group in groups) for groups in self.taken)
+        return ReferenceGroups(*(tuple(group for group in groups if group.size) for groups in kept))
+
+    @property
+    def used(self) -> ReferenceGroups:
+        """The references that correct the views."""
+        return self.taken if self.asked.accepted else self.good
+
+    @cached_property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings on references, flats beside those and the views of their part; errors where none of a kind is good.
+        There are none where pixels are not counts."""
+        if not self.in_counts:
+            return ()
+        darks, found = tuple(self._readable(group) for group in self.taken.darks), dict[Finding, None]()
+        for start, end in pairwise([*self.table.part_starts.tolist(), len(self.table)]):
+            flats = [group for group in self.taken.flats if start <= group[0] < end]
+            seen, views = tuple(self._readable(group) for group in flats), self.table.views_of(start, end)
+            if flats or not self.taken.flats:
+                shown = Evidence((*darks, *seen), self._views_beside(views, flats))
+                found |= dict.fromkeys(judge(shown, self.asked.limits))
+        rows = {row for finding in found for row in finding.frames}
+        good = {self.table.kind(row) for groups in self.taken for group in groups for row in group if row not in rows}
+        return tuple(
+            replace(each, severity="warning") if each.frames and self.table.kind(each.frames[0]) in good else each
+            for each in found
+        )
+
+    def _views_beside(self, views: I64, flats: list[I64]) -> tuple[FrameStatistics, ...]:
+        """Views of the whole part, and next to its flats."""
+        chosen = set(spread(views, VIEWS).tolist())
+        for group in flats:
+            at = int(np.searchsorted(views, group[0]))
+            chosen.update(views[max(at - BESIDE, 0) : at + BESIDE].tolist())
+        return self._readable(np.array(sorted(chosen), np.int64))
+
+    def _readable(self, rows: I64) -> tuple[FrameStatistics, ...]:
+        """The frames, of these rows, that can be read; all, where none can."""
+        read = tuple(self.frame(row) for row in rows.tolist())
+        return tuple(frame for frame in read if frame.row not in self.source.unreadable) or read
+
+    # Frames
+
+    def frame(self, row: int) -> FrameStatistics:
+        """Statistics of a frame of any kind, with its cells, which is read once.
+
+        They are those with the dark of the shortest exposure and, of projections that differ, at the usual exposure.
+        """
+        frame, groups = self._as_it_is(row), self._darks
+        differ = self.views_differ and groups[0][1].size > 0
+        if not frame.exposure > 0 or not (len(groups) > 1 or differ):
+            return frame
+        usual = self.usual_exposure if differ and frame.kind is FrameKind.PROJECTION else frame.exposure
+
+        def levelled(part: str) -> F32:
+            darks = [
+                (s, np.mean([getattr(self._as_it_is(at), part) for at in rows.tolist()], axis=0)) for s, rows in groups
+            ]
+            own = dark_at(frame.exposure, darks) if len(darks) > 1 else darks[0][1]
+            level = darks[0][1] + (getattr(frame, part) - own) * np.float32(usual / frame.exposure)
+            return np.asarray(level, np.float32)
+
+        return replace(frame, blocks=levelled("blocks"), cells=levelled("cells"), exposure=usual)
+
+    def _as_it_is(self, row: int) -> FrameStatistics:
+        table = self.table if row < len(self.table) else self.source.table  # a running scan has grown
+        kind = table.kind(row)
+        if row not in self._seen:
+            image = read_known(self.source, [row])[0]
+            light = self.in_counts and kind is not FrameKind.DARK
+            self._seen[row] = look_at(with_borders_filled(image) if light else image, row)
+        return replace(self._seen[row], kind=kind, exposure=float(table.exposures[row]))
+
+    def cells(self, rows: I64) -> list[F32]:
+        """Cells of some frames, one by one."""
+        return [self.frame(row).places for row in rows.tolist()]
+
+    def mean_cells(self, rows: I64) -> F32:
+        """Cells of the mean of the readable frames."""
+        cells = dict(zip(rows.tolist(), self.cells(rows), strict=True))
+        known = [cells[row] for row in cells if row not in self.source.unreadable] or list(cells.values())
+        return np.asarray(np.nan_to_num(np.mean(known, axis=0)), np.float32)
+
+    # Exposures
+
+    @cached_property
+    def usual_exposure(self) -> float:
+        """The median exposure of the projections in s; NaN if it is unknown."""
+        of_views = self.table.exposures[self.table.views]
+        known = of_views[of_views > 0]
+        return float(np.median(known)) if known.size else np.nan
+
+    @cached_property
+    def views_differ(self) -> bool:
+        """Whether the exposures of the projections differ, and that of each is known."""
+        views = self.table.exposures[self.table.views]
+        return bool(views.size and (views > 0).all() and np.ptp(views) > EXPOSURE_TOLERANCE * np.median(views))
+
+    def by_exposure(self, rows: I64) -> list[tuple[float, I64]]:
+        """The rows of each exposure among these frames; one group, of NaN, if one is unknown or all have one."""
+        seconds = self.table.exposures[rows]
+        if not rows.size or not (seconds > 0).all() or np.ptp(seconds) <= EXPOSURE_TOLERANCE * seconds.min():
+            return [(np.nan, rows)]
+        order = np.argsort(seconds, kind="stable")
+        edges = np.flatnonzero(np.diff(seconds[order]) > EXPOSURE_TOLERANCE * seconds[order][:-1]) + 1
+        return [(float(np.median(self.table.exposures[part])), np.sort(part)) for part in np.split(rows[order], edges)]
+
+    @cached_property
+    def _darks(self) -> list[tuple[float, I64]]:
+        return self.by_exposure(self.table.darks)
+
+    @cached_property
+    def exposures(self) -> F64:
+        """Exposure of each frame in s, NaN where unknown.
+
+        Of flats that state none beside views that differ: the longest, the median or the shortest of the views', the
+        first for which no place of the views is brighter than the flats.
+        """
+        table, exposures = self.table, self.table.exposures
+        flats, darks, views = table.flats[~(exposures[table.flats] > 0)], table.darks, table.views
+        if not (flats.size and darks.size and self.views_differ):
+            return exposures
+        dark, light = (self.mean_cells(rows) for rows in (darks, flats))
+        lit = lit_places(light - dark)
+        seen = [self.mean_cells(row) for row in spread(views, VIEWS)[:, None]]
+        shares = [np.percentile((cells - dark)[lit] / (light - dark)[lit], WORST) for cells in seen if lit.any()]
+        most = self.usual_exposure / max(float(np.median(shares)), 1e-30) if shares else 0.0
+        of_views = exposures[views]
+        for each in (of_views.max(), np.median(of_views), of_views.min()):
+            if each <= (1 + DRIFT) * most:
+                return np.where(np.isin(np.arange(len(table)), flats), each, exposures)
+        return exposures
+
+    # Light of whole views; not of single bands of rows, where a sample may be opaque
+
+    @cached_property
+    def beam(self) -> tuple[F32, F32] | None:
+        """Cells [cell row, cell col] of the mean dark and flat that are used; None where nothing is divided by them."""
+        if not (self.in_counts and all(self.used)):
+            return None
+        dark, flat = (self.mean_cells(np.concatenate(groups)) for groups in self.used)
+        return dark, flat
+
+    @cached_property
+    def brightest(self) -> float:
+        """Brightness of the brightest of some views relative to the flats, see `brightness`; 1 where there is none."""
+        if self.beam is None:
+            return 1.0
+        seen = [brightness(cells, *self.beam) for cells in self.cells(spread(self.table.views, VIEWS))]
+        return float(np.percentile(seen, BRIGHT)) if seen else 1.0
+
+    def suspect(self, data: NDArray[np.generic], beam: tuple[F32, F32] | None) -> NDArray[np.bool_]:
+        """bool [view]: views that are dark or uniform in the pixels read, which may be a band of rows.
+
+        Args:
+            data: [view, row, col], as read.
+            beam: dark and flat [row, col], of the same pixels; None: line integrals.
+        """
+        uniform = np.array([view.min() == view.max() for view in data], np.bool_)
+        if beam is None or not len(data):
+            return uniform
+        some = tuple(slice(None, None, max(1, n // _ACROSS)) for n in beam[0].shape)
+        dark, light = beam[0][some], (beam[1] - beam[0])[some]
+        lit, least = lit_places(light), _SUSPECT * max(self.brightest, 0.0)
+        shares = [np.median((view[some] - dark)[lit] / light[lit]) if lit.any() else 0.0 for view in data]
+        return uniform | ~(np.array(shares) >= least)
+
+    def unlit(self, row: int) -> bool:
+        """Whether a whole view is dark, or uniform while the flats are not; it is looked at once."""
+        if row not in self._lit:
+            self._lit[row] = not self._unlit(row)
+        return not self._lit[row]
+
+    @property
+    def known_unlit(self) -> list[int]:
+        """The views of those looked at that have no light."""
+        return [row for row, lit in self._lit.items() if not lit]
+
+    def _unlit(self, row: int) -> bool:
+        image = read_known(self.source, [row])[0]
+        if row in self.source.unreadable:
+            return False  # it is named and left out by who reads it
+        if not np.isfinite(image).any():
+            return True
+        same = bool(image.min() == image.max())
+        if self.beam is None:
+            return same
+        bright = brightness(self.frame(row).places, *self.beam)
+        return bright < LEAST * self.brightest or (same and bool(np.ptp(self.beam[1]) > 0))
+
+
+def groups_of(table: FrameTable, kind: FrameKind) -> tuple[I64, ...]:
+    """Rows of the references of a kind, by groups: references of one part with no projection between them."""
+    rows = table.of_kind(kind)
+    before = np.searchsorted(table.views, rows)
+    before += np.searchsorted(table.part_starts, rows, "right")  # neither decreases, so that the sum tells both
+    return tuple(np.split(rows, np.flatnonzero(np.diff(before)) + 1)) if rows.size else ()
+
+
+def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
+    """Statistics of an image, with its cells."""
+    counts, block = image.dtype.kind in "ui", check_block(image.shape)
+    saturated = float(np.mean(image >= full_scale(float(image.max())))) if counts else 0.0
+    blocks, cells = (block_means(image, side) for side in (block, max(1, image.shape[1] // CELLS)))
+    invalid = 0.0 if image.dtype == np.uint16 else 1 - float(np.mean(is_valid(image)))
+    kind, rounding = FrameKind.INVALID, LEAST_NOISE * counts
+    return FrameStatistics(row, kind, np.nan, saturated, np.array(thinned(blocks)), block, rounding, invalid, cells)
+
+
+def brightness(view: F32, dark: F32, flat: F32) -> float:
+    """Brightness of a view's bright part relative to the flats, corrected for the bias by noise; from images of
+    cells."""
+    light = flat - dark
+    lit = lit_places(light)
+    if not lit.any():
+        return 1.0
+    share = np.where(lit, (view - dark) / np.where(lit, light, 1), np.nan)
+    noise = deviation_between_neighbours(share)
+    known = share[np.isfinite(share)]
+    if not known.size:
+        return 0.0
+    return max(float(np.median(known)), float(np.percentile(known, BRIGHT)) - _TAIL * noise)
