@@ -6,9 +6,12 @@ What they measure means nothing at these sizes, so that the limits which a scrip
 from __future__ import annotations
 
 import ast
+import contextlib
 import inspect
+import subprocess
 import sys
 import textwrap
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -19,6 +22,7 @@ import pytest
 
 import recon
 from recon.base.error_law import ErrorLaw
+from tests.beamline.cli.small_scan import succeeds
 from tests.beamline.scans import TwoCylinders, write_exchange
 from tests.bench import quality_cases
 from tests.bench.quality_cases import Case
@@ -158,7 +162,8 @@ def test_published(monkeypatch: Patch, tmp_path: Path) -> None:
 
 def test_series(monkeypatch: Patch) -> None:
     bench = script("test_series")
-    small(monkeypatch, bench, SIDE=8, VIEWS=24, PITCH=0.06)
+    small(monkeypatch, bench, SIDE=8, VIEWS=24, PITCH=0.06, PARTS=(1, 2))
+    monkeypatch.setattr(recon, "fit_series", partial(recon.fit_series, tv_weight=0.01, sweeps=3))
     measured(bench.test_one_fit_in_time, bench.FOAM | {"n_holes": 5}, 2, False)
 
 
@@ -208,14 +213,22 @@ def test_scripts_of_scans(monkeypatch: Patch, tmp_path: Path, capsys: pytest.Cap
     assert "of a grain's density" in capsys.readouterr().out
 
 
+def in_this_process(words: list[str], cwd: Path | None = None, **_: object) -> subprocess.CompletedProcess[str]:
+    with contextlib.chdir(cwd or Path()):
+        done = succeeds(*words[3:])  # after `python -m beamline.cli.main`
+    return subprocess.CompletedProcess(words, 0, done.stdout, done.stderr)
+
+
 def test_scripts_of_commands(monkeypatch: Patch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Sizes, times, pages of real scans: each runs `beamline` in processes of its own."""
-    script("size_table").measure(tmp_path, "fbp", 32, 4, 8)
+    """Sizes, times, pages of real scans: each runs `beamline` in processes of its own, which the times do here, too."""
     times = script("table_of_times")
     small(monkeypatch, times, make_scans=lambda folder: None)
     called(monkeypatch, times, tmp_path / "times", "--runs", 1, "--only", "missing scan")
     shown = capsys.readouterr().out
-    assert "CPU s" in shown and "recon of a missing scan" in shown
+    assert "| recon of a missing scan |" in shown
+    monkeypatch.setattr(subprocess, "run", in_this_process)
+    script("size_table").measure(tmp_path, "fbp", 32, 4, 8)
+    assert "CPU s" in capsys.readouterr().out
     pages = script("real_scans")
     (tmp_path / "data").mkdir()
     write_exchange(tmp_path / "data" / "scan.h5", TwoCylinders())
@@ -263,15 +276,10 @@ def test_gpu_curve() -> None:
 
 def test_open_pages(monkeypatch: Patch, tmp_path: Path) -> None:
     bench = script("test_open_pages")
-    small(monkeypatch, bench, PAIRS=1, PAGES=1, VIEWS=72)
-    measured(bench.test_open_pages_cost_a_scan_nothing, tmp_path, 10.0)
+    small(monkeypatch, bench, PAIRS=1, PAGES=1, VIEWS=24)
+    measured(bench.test_open_pages_cost_a_scan_nothing, tmp_path, 20.0)
 
 
 def recon_of(scan: Path, angles: Path, output: Path) -> None:
-    from click.testing import CliRunner
-
-    from beamline.cli.main import main
-
     words = ["recon", str(scan), "-m", "fbp", "--quantity", "line-integrals", "--angles", str(angles), "--axis", "15.5"]
-    done = CliRunner().invoke(main, [*words, "--no-report", "-o", str(output)])
-    assert done.exit_code == 0, done.output
+    succeeds(*words, "--no-report", "-o", str(output))

@@ -127,7 +127,7 @@ def _seconds(
             warm_up(candidate, geometry)
         expected = forecast(method, geometry, grid, now)
     except ValueError as error:  # as the method itself refuses the views
-        raise DataError(f"{options.source.path} cannot be reconstructed by {method.name}: {error}.") from error
+        raise DataError(f"{options.source.path} cannot be reconstructed by {method.name}: {error}") from error
     if expected is None:
         return None
     choice = 0.0 if options.partial is not None else expected.choice_seconds  # it was made before

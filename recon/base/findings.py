@@ -60,7 +60,8 @@ def faults_of(
             key = (*path, *(words[0].rstrip(":,").split(".") if words else ()))
             sentence = f"{name}{'' if message.startswith('must ') else ':'} {message}" if name else message
         elif "[key]" in finding["loc"]:
-            sentence = f"{name}: key must be {message.removeprefix('Input should be ')}"
+            legal = "a whole number" if kind.startswith("int") else message.removeprefix("Input should be ")
+            sentence = f"{name}: key must be {legal}"
         elif kind in ("extra_forbidden", "unexpected_keyword_argument"):
             sentence = _of_unknown(path, name, data, schema, former, advice)
         else:

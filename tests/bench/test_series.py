@@ -21,6 +21,7 @@ from simulators.scenes.scene import load_scene
 
 pytestmark = pytest.mark.bench
 SIDE, PITCH, PHOTONS, VIEWS = 48, 0.01, 5e4, 72
+PARTS = 1, 2, 3, 4, 6  # sub-scans beside which the fit stands
 TIMES = (np.arange(12) + 0.5) / 12
 FOAM = {"kind": "foam", "diameter": 0.408, "height": 0.408, "n_holes": 120, "largest_um": 107.0, "smallest_um": 35.0,
         "gap_um": 4.0, "candidates": 40_000, "change": {"kind": "settle", "share": 0.25, "over_s": 0.7}}  # fmt: skip
@@ -66,7 +67,7 @@ def test_one_fit_in_time(phantom: dict[str, Any], knots: int, motion: bool) -> N
         return float(10 * np.log10(np.ptp(truth) ** 2 / ((found - truth) ** 2).mean()))
 
     others = {}
-    for parts in (1, 2, 3, 4, 6):
+    for parts in PARTS:
         began = time.process_time()
         others[parts] = psnr(of_sub_scans(views, parts))
         print(

@@ -23,6 +23,7 @@ from recon.methods import accepting, build, by_name, names_of_one_volume
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS
+from tests.refused_calls import refused_calls
 from tests.slow_cases import others_slow
 
 
@@ -92,21 +93,6 @@ def test_bad_input_is_refused(noisy: np.ndarray, change: dict[str, object], mess
     arguments = {"projections": noisy, "geometry": VIEWS} | change
     with pytest.raises(ValueError, match=message):
         recon.reconstruct(**arguments)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("method", "change", "message"),
-    [
-        (Fbp, {"filter": "magic"}, "filter 'magic' is unknown; legal: ram-lak, "),
-        (R2, {"steps": -1}, "steps must be"),
-        (R2, {"seconds": -1.0}, "seconds must be"),
-        (R2, {"seconds": float("nan")}, "seconds must be"),
-        (R2, {"start": "magic"}, "start 'magic' is unknown; legal: fbp, "),
-    ],
-)
-def test_bad_settings_are_refused(method: type[R2], change: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        method(**change)  # type: ignore[arg-type]
 
 
 OF_A_FIT: dict[str, dict[str, object]] = {
@@ -354,3 +340,6 @@ def test_a_leaning_axis_asks_for_a_weight_as_no_view_judges_structure_along_it(
     said = [str(each.message) for each in told if "leans along the beam by 30 degrees" in str(each.message)]
     assert bool(said) is warned
     assert all("tv_weight 0.001" in each for each in said)
+
+
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -37,17 +37,24 @@ class Wire:
         assert reply.count(b"\r\n") == 1
         return reply[:-2].decode()
 
-    def train(self, start: int, end: int, interval: int) -> None:
-        self.tell("TMGC0", f"TMGS0{start:+d}", f"TMGE0{end:+d}", f"TMGI0{interval}", "TMGR0")
+    def train(self, start: int | str, end: int | str, interval: int | str) -> None:
+        self.tell("TMGC0", f"TMGS0{int(start):+d}", f"TMGE0{int(end):+d}", f"TMGI0{interval}", "TMGR0")
+
+    def rest(self) -> None:
+        self.clock.sleep(3600.0)
 
     def run(self, *commands: str) -> None:
         """Give commands and let an hour pass."""
         self.tell(*commands)
-        self.clock.sleep(3600.0)
+        self.rest()
 
     def pulses(self) -> list[EmittedPulse]:
         return emitted(self.line, self.clock)
 
-    def counts(self) -> list[int]:
+    def at(self, time: float) -> float:
+        """Counts."""
+        return self.line.angle_at(time) * TURN / (2 * math.pi)
+
+    def places(self) -> list[int]:
         """Where the pulses were, in counts."""
         return [round(pulse.angle * TURN / (2 * math.pi)) for pulse in self.pulses()]

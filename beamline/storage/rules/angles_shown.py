@@ -105,6 +105,14 @@ class CoarseViews:
                 return max(float(here - (below - above) ** 2 / 8 / max(below - 2 * here + above, 1e-12)), 0.0)
         return float(curve.min())
 
+    def all_unlike(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """`unlike` of every two of these views [view, view]."""
+        depths = np.stack([self.depth(row).ravel() for row in rows.tolist()])
+        norms = np.array([np.linalg.norm(depth) for depth in depths])
+        products = np.stack([(depth * depths).sum(axis=1) for depth in depths])
+        powers = np.multiply.outer(norms, norms)
+        return 1 - np.divide(products, powers, out=np.zeros_like(powers), where=powers > 0)
+
     def typical(self, pairs: Sequence[Pair]) -> float:
         """Median of `unlike`."""
         return float(np.median([self.unlike(pair) for pair in pairs]))
@@ -289,7 +297,7 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | No
     if some.size < PAIRS:
         return None
     degrees = seen.degrees[some] % 360
-    unlike = np.array([[seen.unlike((int(one), int(other))) for other in some] for one in some])
+    unlike = seen.all_unlike(some)
     apart = np.abs((degrees - degrees[:, None] + 180) % 360 - 180)
     far = np.where(apart > max(OTHER * 180, 2 * float(np.median(np.diff(degrees)))), unlike, np.nan)
     if not np.isfinite(far).any():

@@ -45,19 +45,3 @@ def test_schema_is_json() -> None:
     result = run("schema")
     assert result.exit_code == 0
     assert json.loads(result.stdout) == config.schema()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("show", "absent.yaml"), "absent.yaml does not exist"),
-        (("show",), "Missing argument 'CONFIG'"),
-        (("init", "--nonsense"), "--nonsense"),
-        (("frobnicate",), "frobnicate"),
-    ],
-)
-def test_usage_faults_are_exit_code_2(arguments: tuple[str, ...], message: str) -> None:
-    result = run(*arguments)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert result.stdout == ""

@@ -47,30 +47,6 @@ def test_the_command_line_goes_before_the_recipe(folder: Path) -> None:
     assert record.parameters["recipe"] == "method: sirt\niterations: 2\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("methods: fbp\n", "option of a recipe 'methods' is unknown; legal: method"),
-        ("output: v.h5\n", "option of a recipe 'output' is unknown"),
-        ("method: [fbp, r2]\n", "expected one value"),
-        ("method: r3\n", "r3"),
-        ("rows: 5\n", "FIRST:END"),
-        ("method: fbp\niterations: 3\n", "--iterations is of fista-tv, os-sirt-tv, pnp-dct, sirt"),
-        ("just text\n", "expected lines such as"),
-        ("a: b: c\n", "YAML"),
-        ("method: &a [x, x]\n" + "".join(f"b{i}: &b{i} [*a, *a, *a]\n" for i in range(9)), "expected one value"),
-        ("method: " + "[" * 1000, "64 groups within each other"),
-        ("\x00", "YAML"),
-    ],
-)
-def test_a_recipe_that_is_wrong_is_refused_before_any_work(folder: Path, text: str, said: str) -> None:
-    (folder / "r.yaml").write_text(text)
-    result = beamline("recon", "scan.h5", "--config", "r.yaml")
-    assert result.exit_code == 2, result.output
-    assert said in " ".join(result.stderr.split())
-    assert left(folder) == {"scan.h5", "r.yaml"}
-
-
 def test_any_setting_comes_by_its_name_and_a_recipe_keeps_it(folder: Path) -> None:
     short = ("-m", "r2-published", "--steps", "3", "--gaussians", "60", "--rows", "0:1", "--no-report")
     settings = ("--set", "fit.decay=0.2 fit.rates=[1e-4,5e-3,1e-3,1e-2]", "--set", "fit.policy.every=50")

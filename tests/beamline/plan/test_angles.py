@@ -13,6 +13,7 @@ from beamline.plan.plan import Mode, Retake, middle_of_exposure, retake_block, s
 from beamline.plan.timeline import work_out
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import FakeInstrument
+from tests.refused_calls import refused_calls
 
 VIEWS = st.integers(1, 400)
 START = st.floats(-10, 10)
@@ -80,12 +81,6 @@ def test_interlaced_gaps_halve(power: int, done: int) -> None:
     assert gaps.max() <= 2 * gaps.min() + 1e-9
 
 
-@pytest.mark.parametrize(("views", "passes"), [(10, 3), (10, 10), (10, 0), (3, 2)])
-def test_interlaced_names_the_legal_passes(views: int, passes: int) -> None:
-    with pytest.raises(ValueError, match=f"{views} views.*legal passes: 1"):
-        angles.interlaced(views, passes)
-
-
 @given(views=st.integers(2, 400), start=START, span=SPAN)
 def test_golden_spreads_by_the_three_gap_theorem(views: int, start: float, span: float) -> None:
     """Any n multiples of an irrational cut the circle in at most three gap lengths, the largest the sum of the others.
@@ -119,30 +114,6 @@ def test_decimals_may_follow_a_comma(step: float) -> None:
     degrees = np.round(step * np.arange(-20, 20), 3)
     text = "\n".join(f"{each:.3f} # view".replace(".", ",") for each in degrees)
     np.testing.assert_allclose(np.degrees(angles.from_text(text)), degrees)
-
-
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("0\nten\n", "line 2 holds 'ten'"),
-        ("0\n1 2\n", "line 2 holds '1 2'"),
-        ("0\n\nnan\n", "line 3 holds 'nan'"),
-        ("# nothing\n\n", "no angle"),
-        ("0,5,1.0\n1,0,1.5", "0,1.5.*one angle a line"),
-        ("0,0\n1,2\n2,4\n# end", "the number of a view and its angle"),
-        ("0,0\n2,1\n4,2", "the number of a view and its angle"),
-        ("0,5\n1.0", "0,5 has a comma beside 1.0 with a point"),
-    ],
-)
-def test_file_names_the_line(text: str, problem: str) -> None:
-    with pytest.raises(ValueError, match=problem):
-        angles.from_text(text)
-
-
-@pytest.mark.parametrize("plan", [angles.fixed, angles.golden])
-def test_no_views_is_refused(plan: object) -> None:
-    with pytest.raises(ValueError, match="at least 1 view"):
-        plan(0)  # type: ignore[operator]
 
 
 @given(st.integers(1, 200), st.integers(1, 60))
@@ -191,3 +162,6 @@ def test_bytes_and_seconds_of_the_most_are_foreseen(share: float, most: int) -> 
     for free, fits in ((needed + 9, True), (needed - 9, False)):
         tried = work_out(plan, stage.limits, stage.to_counts, camera.timing, free_bytes=free)
         assert (tried.violations == ()) is fits
+
+
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from beamline.plan import plan as angles
 from beamline.plan.limits import Scale, plan_flight
 from drivers.base.protocols import TriggerTrain
+from tests.refused_calls import refused_calls
 
 COUNTS = st.sampled_from([7200, 36_000, 360_000, 1_048_576])
 
@@ -96,19 +97,4 @@ def test_random_views_cannot_fly(views: int, seed: int) -> None:
         plan_flight(theta, stage())
 
 
-@pytest.mark.parametrize(
-    ("theta", "problem"),
-    [
-        (angles.golden(50), "not equally spaced"),
-        (np.zeros(3), "not equally spaced"),
-        (np.deg2rad([0.0, 1.0, 1.0]), "not equally spaced"),
-        (np.deg2rad([0.0, 1.0, 3.0]), "not equally spaced"),
-        (np.deg2rad([0.0, 3.0, 1.0, 2.0, 4.0]), "not come in passes of equal steps"),
-        (np.deg2rad([0.0, 2.0, 1.0]), "not come in passes of equal steps"),
-        (np.array([1.0]), "at least 2 views"),
-        (np.deg2rad([0.0, 0.0004, 0.0008]), "0.4 counts of the stage.*fewer views"),
-    ],
-)
-def test_plans_that_cannot_fly_say_why(theta: np.ndarray, problem: str) -> None:
-    with pytest.raises(ValueError, match=problem):
-        plan_flight(theta, stage())
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -100,22 +100,3 @@ def test_ctrl_c_keeps_the_volume_and_leaves_it_out(folder: Path, monkeypatch: py
     assert "There are no error bars: their computation was stopped." in result.stderr
     record = read_reconstruction(Path("out.h5"))
     assert record.deviation is None and record.volume.data.any() and "ended_early" not in record.parameters
-
-
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        ("sirt", "--uncertainty is calibrated for r2, fbp, fista-tv, pnp-dct"),
-        ("sirt --dry-run", "--uncertainty is calibrated for r2, fbp, fista-tv, pnp-dct"),
-        ("fbp -o out.tif", "give -o out.h5"),
-        ("r2 --finish 0", "--finish 0"),
-        ("fbp --views fixed:6", "at least 8 views are needed, got 6"),
-        ("r2 --seconds 5", "--uncertainty does not go with"),
-        ("r2 --follow", "--uncertainty does not go with"),
-    ],
-)
-def test_what_is_impossible_is_refused_and_nothing_written(folder: Path, options: str, why: str) -> None:
-    result = beamline("recon", "scan.h5", "--uncertainty", "-m", *options.split())
-    assert result.exit_code == 2, result.output
-    assert why in " ".join(result.stderr.split())
-    assert left(folder) == {"scan.h5"}

@@ -34,6 +34,7 @@ from recon.splatting.settings import FitSettings
 from recon.voxels.direct import Fbp
 from tests.beamline.scans import TwoCylinders, frames_of, write_exchange
 from tests.clock import SteppedClock
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -178,7 +179,7 @@ def test_existing_results_are_never_touched(tmp_path: Path, existing: str) -> No
     assert _names(tmp_path) == {"scan.h5", existing}
 
 
-@pytest.mark.parametrize("error", [DataError("no space left"), ValueError("module://absent")])
+@pytest.mark.parametrize("error", others_slow([DataError("no space left"), ValueError("module://absent")]))
 def test_a_report_that_fails_costs_a_warning_and_no_volume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
@@ -277,7 +278,7 @@ def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> N
     assert np.isfinite(record.history["held_out"][-1])
 
 
-@pytest.mark.parametrize("method", ["cgls", "os-sirt-tv"])
+@pytest.mark.parametrize("method", others_slow(["cgls", "os-sirt-tv"]))
 def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str) -> None:
     events: list[Event] = []
     options = _options(

@@ -83,23 +83,6 @@ def test_fbp_of_a_region_reports_no_residual() -> None:
 
 
 @pytest.mark.parametrize(
-    ("region", "options", "said"),
-    [
-        ("38:60,10:40", "-m fbp", "is not Z0:Z1,Y0:Y1,X0:X1"),
-        ("38:97,10:40,4:29", "-m fbp", "slices 38:97"),
-        ("38:60,10:40,4:29", "-m fbp --cone 50:70", "is a cone"),
-        ("38:60,10:40,4:29", "-m fbp --calibrate axis,shifts,roll", "--calibrate roll and --calibrate shift"),
-        ("38:60,10:40,4:29", "--follow", "does not go with --follow"),
-        ("38:60,10:40,4:29", "-m fbp --max-residual 1", "needs the whole volume"),
-    ],
-)
-def test_refused_with_nothing_written(folder: Path, region: str, options: str, said: str) -> None:
-    result = beamline("recon", "scan.h5", "--roi", region, *options.split(), "-o", "out.h5")
-    assert result.exit_code == 2 and said in result.stderr, result.output
-    assert left(folder) == {"scan.h5"}
-
-
-@pytest.mark.parametrize(
     ("options", "step", "said"),
     [
         ("38:60,10:40,4:49 --axis 23.2", "ScanCorrection", "x 4:49 does not lie"),

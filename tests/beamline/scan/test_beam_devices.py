@@ -28,6 +28,7 @@ from tests.beamline import ran
 from tests.beamline.ball_scan import COMMON, shipped, small, with_scene
 from tests.beamline.fakes import FakeInstrument
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, serve_pva
+from tests.refused_calls import refused_calls
 
 FILTER = "devices.filter={kind: simulated, places: [none, Al 1 mm]}"
 MONOCHROMATOR = "devices.monochromator={kind: simulated}"
@@ -160,33 +161,6 @@ def test_the_simulated_beam_has_the_energy_in_a_scan_and_in_tune(tmp_path: Path)
         assert on.devices.monochromator.energy() == 8.35
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (
-            (FILTER, "scan.filter=Cu"),
-            r"scan\.filter 'Cu' is not one of the filter's places; devices\.filter has none, Al 1 mm",
-        ),
-        (("scan.filter=Cu",), r"scan\.filter 'Cu' is not one of the filter's places; devices\.filter has none"),
-        (("devices.filter={kind: epics, pv: 'pva://f', places: {a: 1, b: 1}}",), "have the same value"),
-        (("devices.filter={kind: epics, pv: 'pva://f', places: {a: 1}}",), r"simulated.*filter real"),
-        (
-            (f"devices.filter={{kind: stage, places: {{a: 999}}, stage: {MOTOR}}}",),
-            "a 999 is beyond the limits",
-        ),
-        (("scan.energy=8.3",), r"scan\.energy needs a monochromator, and devices\.monochromator\.kind is none"),
-        (
-            ("devices.monochromator={kind: simulated, range_kev: [4, 8]}", "scan.energy=8.3"),
-            r"scan\.energy: 8\.3 keV is not within devices\.monochromator\.range_kev 4 \.\.\. 8",
-        ),
-        (("devices.monochromator={kind: manual}",), r"simulated.*monochromator real"),
-    ],
-)
-def test_a_wrong_configuration_is_refused(words: tuple[str, ...], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        small(*words)
-
-
 def test_a_beam_of_many_energies_has_no_monochromator() -> None:
     tube = NICKEL | {"beam": {"photons_per_s": 1.0e5, "tube": {"kv": 60}}}
     with pytest.raises(ConfigError, match="gives one energy"):
@@ -224,3 +198,6 @@ def test_a_check_reads_where_it_stands(monkeypatch: pytest.MonkeyPatch, tmp_path
             assert found() == ("", expected)
         ioc.stop()
     assert found()[0]
+
+
+test_calls_that_are_refused = refused_calls(__file__, globals())

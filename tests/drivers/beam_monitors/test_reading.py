@@ -16,12 +16,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base.clock import SystemClock
-from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.base.protocols import BeamMonitor, BeamReading
 from drivers.beam_monitors import PATTERN, ElectrometerQuery, PageSource, SerialSource, TextBeamMonitor
 from simulators.devices.clock import VirtualClock
-from simulators.wires.electrometer import OVER_RANGE, ElectrometerWire
+from simulators.wires.electrometer import ElectrometerWire
 from simulators.wires.wire import register
+from tests.refused_calls import refused_calls
 
 RING = "Ring current: ([-+0-9.eE]+) mA"
 
@@ -81,21 +82,6 @@ def test_a_long_page_is_told_in_part() -> None:
     with pytest.raises(DeviceError) as caught:
         monitor("x" * 100_000).reading()
     assert len(str(caught.value)) < 600
-
-
-@pytest.mark.parametrize(
-    ("pattern", "problem"),
-    [("(", "a regular expression"), ("(?i)(x)", "a regular expression"), ("mA", "no group")],
-)
-def test_patterns_that_find_nothing(pattern: str, problem: str) -> None:
-    with pytest.raises(DeviceRefused, match=problem):
-        monitor("", pattern)
-
-
-@pytest.mark.parametrize("scale", [0.0, float("nan")])
-def test_a_scale_must_be_one(scale: float) -> None:
-    with pytest.raises(DeviceRefused, match="scale"):
-        monitor("", scale=scale)
 
 
 @contextmanager
@@ -221,12 +207,6 @@ def test_a_file_that_another_program_keeps(tmp_path: Path) -> None:
         source.reading()
 
 
-@pytest.mark.parametrize("url", ["ring.html", "ftp://host/x", "http://", "http:///ring", "http://[::1/ring", ""])
-def test_addresses_that_are_none(url: str) -> None:
-    with pytest.raises(DeviceRefused, match="of a page"):
-        ring(url)
-
-
 NAMES = (f"electrometer-{number}" for number in itertools.count())
 
 
@@ -272,11 +252,4 @@ def test_garbage_is_no_reading_and_then_it_goes_on(text: bytes) -> None:
     assert monitor.reading().value == 1e-9
 
 
-def test_over_range() -> None:
-    with pytest.raises(DeviceError, match="over range"):
-        over(ElectrometerWire(VirtualClock(), lambda time: OVER_RANGE)).reading()
-
-
-def test_an_empty_query() -> None:
-    with pytest.raises(DeviceRefused, match="query is empty"):
-        over(ElectrometerWire(VirtualClock()), query="")
+test_calls_that_are_refused = refused_calls(__file__, globals())

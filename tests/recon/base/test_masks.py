@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.base.masks import areas, masked, usual_weight
+from tests.refused_calls import refused_calls
 
 RNG = np.random.default_rng(0)
 DATA = np.maximum(RNG.normal(0.2, 0.5, (4, 12, 30)), 0).astype(np.float32)
@@ -75,21 +76,6 @@ def test_values_beyond_the_largest_count_as_not_finite() -> None:
         masked(data, largest=0.5)
 
 
-@pytest.mark.parametrize(
-    ("data", "weight", "message"),
-    [
-        (np.full((2, 2, 2), np.nan), None, "2 of 2 views have no value"),
-        (np.ones((1, 2, 2)), np.zeros((1, 2, 2)), "leave these views out"),
-        (np.ones((1, 2, 2)), -np.ones((1, 2, 2)), "0 or more"),
-        (np.ones((1, 2, 2)), np.full((1, 2, 2), np.nan), "finite"),
-        (np.ones((1, 2, 2)), np.ones((2, 2)), "shape"),
-    ],
-)
-def test_what_cannot_be_filled_is_refused(data: np.ndarray, weight: np.ndarray | None, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        masked(data.astype(np.float32), None if weight is None else weight.astype(np.float32))
-
-
 @given(st.integers(1, 12), st.integers(1, 12), st.floats(0, 0.99), st.integers(0, 1000))
 def test_filled_values_lie_between_known_ones(rows: int, cols: int, share: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -110,3 +96,6 @@ def test_areas_are_what_three_by_three_pixels_fit_into() -> None:
     one_row = np.zeros((1, 9), np.bool_)
     one_row[0, :4] = True
     assert areas(one_row).sum() == 4 and not areas(np.eye(5, dtype=np.bool_)).any()
+
+
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
+from tests.refused_calls import refused_calls
 
 HALF = np.deg2rad(np.arange(0, 180, 1.0))
 
@@ -101,41 +102,4 @@ def test_the_number_asked_for_ascending_and_none_twice(form: str, angles: list[f
     assert 0 <= chosen[0] <= chosen[-1] < len(angles)
 
 
-@pytest.mark.parametrize(
-    "spec",
-    [
-        "",
-        "some",
-        "all:3",
-        "fixed",
-        "fixed:",
-        "fixed:x",
-        "fixed:-3",
-        "fixed:1.5",
-        "sector:30",
-        "sector:a-b",
-        "random:3:x",
-    ],
-)
-def test_other_forms_are_refused_with_the_legal_ones(spec: str) -> None:
-    with pytest.raises(ValueError, match=r"sector:A-B\[:N\] \(degrees\), random:N"):
-        parse_views(spec, HALF)
-
-
-@pytest.mark.parametrize("spec", ["fixed:181", "first:0", "random:200", "sector:30-40:12"])
-def test_more_than_there_are_is_refused_with_the_number(spec: str) -> None:
-    with pytest.raises(ValueError, match=r"give a number from 1 to (180|11)$"):
-        parse_views(spec, HALF)
-
-
-@pytest.mark.parametrize("spec", ["all", "fixed:2", "sector:0-90"])
-def test_views_without_an_angle_are_named(spec: str) -> None:
-    with pytest.raises(ValueError, match=r"views \[1\] have no angle"):
-        parse_views(spec, [0.0, np.nan, 1.0])
-
-
-def test_sectors_without_extent_or_views_are_refused() -> None:
-    with pytest.raises(ValueError, match="end after it begins"):
-        parse_views("sector:50-30", HALF)
-    with pytest.raises(ValueError, match=r"0\.00 to 179\.00"):
-        parse_views("sector:200-300", HALF)
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from recon.post import enhanced, inscribed_box, rescaled, sample_circle
 from tests.recon.post.phantom import CIRCLE, SHAPE, WALL, can
+from tests.refused_calls import refused_calls
 
 
 def test_the_circle_is_that_of_the_can() -> None:
@@ -42,19 +43,4 @@ def test_gamma_comes_before_the_filter(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(enhanced(volume, (0, 100), 0.5, 1.5), expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("settings", "said"),
-    [({"percentiles": (60, 40)}, "rise"), ({"gamma": 0.0}, "gamma"), ({"sigma": -1.0}, "sigma")],
-)
-def test_bad_settings_are_refused(settings: dict[str, object], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        enhanced(can(), **settings)  # type: ignore[arg-type]
-
-
-def test_a_volume_without_contrast_is_refused() -> None:
-    with pytest.raises(ValueError, match="nothing to rescale"):
-        rescaled(np.ones((3, 3, 3), np.float32))
-    with pytest.raises(ValueError, match="clusters"):
-        sample_circle(np.ones((3, 3, 3), np.float32))
-    with pytest.raises(ValueError, match="no voxel"):
-        inscribed_box((3, 4, 4), (2.5, 2.5, 0.1))
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from recon.prep.align import AxisError, find_axis
 from recon.prep.axis_ends import ENDS, axis_from_ends
 from recon.prep.axis_wedge import axis_from_sinogram
+from tests.slow_cases import others_slow
 
 COLS, ROWS = 96, 4
 
@@ -37,7 +38,7 @@ def half_turn(n: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("over", [1.5, 3.0])
-@pytest.mark.parametrize("axis_col", [47.5, 51.2, 44.13])
+@pytest.mark.parametrize("axis_col", others_slow([47.5, 51.2, 44.13]))
 def test_the_axis_of_half_a_turn_of_a_wider_sample(over: float, axis_col: float) -> None:
     """The wedge, which needs the whole sample in the field, is not sure, and columns off."""
     views = grains(5, over, half_turn(120), axis_col)

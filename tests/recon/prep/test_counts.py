@@ -11,6 +11,7 @@ from scipy import special
 
 import recon
 from recon.prep.counts import Counts, expanded, line_integrals, of_view, photon_transfer
+from tests.refused_calls import refused_calls
 
 F64 = NDArray[np.float64]
 SHAPE = (8, 48)
@@ -171,30 +172,10 @@ def test_photon_transfer_finds_gain_and_dark_noise() -> None:
     assert variance == pytest.approx(16, rel=0.1)
 
 
-def test_photon_transfer_refuses_frames_without_a_gain() -> None:
-    with pytest.raises(ValueError, match="two frames or more"):
-        photon_transfer(np.ones((1, 4, 4)))
-    with pytest.raises(ValueError, match="give the gain"):
-        photon_transfer(np.full((3, 4, 4), 100.0))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"counts": np.ones((4, 4))}, "counts must be"),
-        ({"flat": np.ones((3, 3))}, "flat has shape"),
-        ({"dark": np.ones(3)}, "dark has shape"),
-        ({"dark": 20.0}, "no beam"),
-        ({"gain": 0.0}, "gain is the counts of one photon"),
-        ({"variance": -1.0}, "variance must be 0 or more"),
-    ],
-)
-def test_counts_that_make_no_sense_are_refused(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Counts(**({"counts": np.ones((2, 4, 4)), "flat": np.full((4, 4), 10.0)} | change))
-
-
 def test_shapes_that_disagree_with_the_geometry_are_refused() -> None:
     counts = Counts(np.ones((2, 4, 4)), np.full((4, 4), 10.0))
     with pytest.raises(ValueError, match="counts have shape"):
         recon.reconstruct(counts, VIEWS)
+
+
+test_calls_that_are_refused = refused_calls(__file__, globals())

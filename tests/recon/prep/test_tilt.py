@@ -13,6 +13,7 @@ import pytest
 from recon.prep.resample import Resampling
 from recon.prep.tilt import TiltEstimate, find_tilt, roll_of_mean_view
 from tests.recon.prep.balls import Balls
+from tests.slow_cases import others_slow
 
 HALF = Balls(np.radians(np.arange(0, 180, 2.0)))
 
@@ -24,7 +25,7 @@ def _found(views: np.ndarray, angles: np.ndarray) -> TiltEstimate:
     return find_tilt(bands, first + 0.5 - (rows - 1) / 2, angles)
 
 
-@pytest.mark.parametrize("tilt", [0.0, 2.0])
+@pytest.mark.parametrize("tilt", others_slow([2.0, 0.0]))
 def test_a_tilt_is_found_within_its_uncertainty(tilt: float) -> None:
     """By levelled views, as `find_tilt` says, of three samples with noise of a tenth of the typical line integral."""
     misses = []
@@ -81,7 +82,7 @@ def test_what_does_not_show_an_axis_is_refused() -> None:
         find_tilt(noise[:, :3], np.arange(3.0), HALF.angles)
 
 
-@pytest.mark.parametrize("roll", [0.0, -0.5, 1.0, 3.0])
+@pytest.mark.parametrize("roll", others_slow([-0.5, 1.0, 0.0, 3.0], 2))
 @pytest.mark.parametrize("off", [0.0, 0.7])
 def test_the_mean_of_a_turn_tells_a_lean(roll: float, off: float) -> None:
     """Discs about an axis that leans, of unlike heights and sizes; a light that slopes, and an axis said wrongly."""

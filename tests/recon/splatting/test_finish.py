@@ -26,6 +26,7 @@ from recon.splatting.splat import project, voxelize
 from recon.voxels.direct import Fbp
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
+from tests.slow_cases import others_slow
 
 F32 = NDArray[np.float32]
 VIEWS = Geometry.parallel(np.linspace(0, math.pi, 30, endpoint=False), (8, 40))
@@ -187,7 +188,7 @@ def test_what_cannot_be_is_refused() -> None:
         build(Fbp, {"finish": 2})
 
 
-@pytest.mark.parametrize(("voxels", "seconds"), [(24, None), (12, 1e9)])
+@pytest.mark.parametrize(("voxels", "seconds"), others_slow([(12, 1e9), (24, None)]))
 def test_a_longer_fit_changes_less(voxels: int, seconds: float | None) -> None:
     """Four times the steps: half the rates; so by a clock, too."""
     cone = Geometry.cone(np.linspace(0, 2 * math.pi, 12, endpoint=False), (24, 24), 1.0, 60.0, 72.0)

@@ -15,22 +15,24 @@ from recon.voxels.devices import CPU, projector_on, voxel_device
 from recon.voxels.direct import direct
 from recon.voxels.projector import Projector
 from tests.recon.kernels.gpu.on_gpu import DEVICE
+from tests.slow_cases import others_slow
 
 ROWS, COLS, VIEWS = 4, 12, 16
 ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
 PARALLEL = Geometry.parallel(ANGLES, (ROWS, COLS), pixel_pitch=0.1)
 CONE = Geometry.cone(2 * ANGLES, (ROWS, COLS), 0.2, 20.0, 40.0)
 LEANED = Geometry.parallel(ANGLES, (ROWS, COLS), pixel_pitch=0.1, roll=0.05)  # projected on the CPU: fast
+FEW = slice(None, None, 4)  # views, where the interpreter projects
 
 
 @pytest.mark.parametrize(
     "geometry", [PARALLEL, PARALLEL.seen_with(RayWidth(arc=0.2)), CONE, LEANED], ids=["still", "arc", "cone", "leaned"]
 )
 def test_projections_on_a_gpu_are_those_of_the_cpu(geometry: Geometry) -> None:
-    projector, device = Projector(geometry, Grid.matching(geometry)), voxel_device("cuda")
-    rng = np.random.default_rng(1)
+    few, device = geometry.select(FEW), voxel_device("cuda")
+    projector, rng = Projector(few, Grid.matching(few)), np.random.default_rng(1)
     there, here = projector_on(device, projector), projector_on(CPU, projector)
-    volume, views = rng.random((COLS, COLS, ROWS), np.float32), rng.random((VIEWS, COLS, ROWS), np.float32)
+    volume, views = rng.random((COLS, COLS, ROWS), np.float32), rng.random((few.n_views, COLS, ROWS), np.float32)
     seen, back = here.forward_lines(volume), here.adjoint_lines(views)
     np.testing.assert_allclose(device.numpy(there.forward_lines(device.array(volume))), seen, atol=3e-6 * seen.max())
     into = device.zeros(volume.shape)
@@ -49,7 +51,7 @@ def views_of(geometry: Geometry) -> np.ndarray:
 
 @pytest.mark.parametrize("beam", [CONE, LEANED], ids=["cone", "leaned"])
 def test_filtered_back_projection_on_a_gpu_is_that_of_the_cpu(beam: Geometry) -> None:
-    few, told = beam.select(slice(None, None, 4)), list[tuple[int, int]]()
+    few, told = beam.select(FEW), list[tuple[int, int]]()
     grid, data = Grid.matching(few), views_of(few)
     here = direct(data, few, grid, "hann")
     there = direct(data, few, grid, "hann", lambda *done: told.append(done), device="cuda")
@@ -67,18 +69,27 @@ def assert_same_volumes(geometry: Geometry, method: recon.Method, weighted: bool
     np.testing.assert_allclose(there, here, atol=off)
 
 
-@pytest.mark.parametrize("weighted", [False, True])
+CHOSEN, GIVEN, PATCHES, FINISH = (
+    FistaTv(iterations=2), FistaTv(iterations=2, tv_weight=0.02), PnpDct(iterations=6), recon.R2(steps=0)
+)  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "method",
-    [FistaTv(iterations=2), FistaTv(iterations=2, tv_weight=0.02), PnpDct(iterations=6), recon.R2(steps=0)],
-    ids=["chosen", "given", "patches", "finish"],
-)
+    ("method", "weighted"),
+    others_slow(
+        [
+            (CHOSEN, False), (GIVEN, True), (PATCHES, False), (FINISH, True),
+            (CHOSEN, True), (GIVEN, False), (PATCHES, True), (FINISH, False),
+        ],
+        quick=4,
+    ),
+)  # fmt: skip
 def test_volumes_made_on_a_gpu_are_those_of_the_cpu(method: recon.Method, weighted: bool) -> None:
     off = 1e-3 if isinstance(method, recon.R2) else 2e-5  # 35 steps of patches: at a threshold rounding decides
     assert_same_volumes(LEANED, method, weighted, off)
 
 
-@pytest.mark.parametrize("beam", [PARALLEL, CONE], ids=["parallel", "cone"])
+@pytest.mark.parametrize("beam", others_slow([PARALLEL, CONE]))
 def test_a_gpu_that_projects_makes_the_volume_of_the_cpu(beam: Geometry) -> None:
-    few = beam.select(slice(None, None, 4)).rows(1, 3).binned(2)  # each projection takes the interpreter a second
+    few = beam.select(FEW).rows(1, 3).binned(2)  # each projection takes the interpreter a second
     assert_same_volumes(few, FistaTv(iterations=1, subsets=1, tv_weight=0.02), True)

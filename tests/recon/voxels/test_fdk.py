@@ -30,7 +30,7 @@ def inside(grid: Grid, radius: float, centre: tuple[float, float, float]) -> NDA
     return (x - centre[0]) ** 2 + (y[:, None] - centre[1]) ** 2 + (z[:, None, None] - centre[2]) ** 2 < radius**2
 
 
-@pytest.mark.parametrize("arc", [210, 250, 320])
+@pytest.mark.parametrize("arc", others_slow([210, 250, 320]))
 def test_a_short_scan_shows_the_ball_as_a_full_turn_does(arc: float, rng: np.random.Generator) -> None:
     angles = rng.permutation(np.deg2rad(np.linspace(0, arc, 160) + 40))
     short = Geometry.cone(angles, (17, 48), 1.0, 80.0, 160.0)

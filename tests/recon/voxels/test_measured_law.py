@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from recon.voxels.voxel_problem import VoxelProblem
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
+from tests.slow_cases import others_slow
 
 F32 = NDArray[np.float32]
 SIDE, ROWS = 48, 8
@@ -34,9 +36,10 @@ def sample(balls: int) -> Phantom:
     return Phantom.of((Cylinder(0.42, 1.0, 2.0), *bodies))
 
 
-def scan(n: int, photons: float, seed: int = 0, cols: int = SIDE) -> tuple[F32, Geometry, F32, F32]:
+@cache
+def scan(n: int, photons: float, cols: int = SIDE) -> tuple[F32, Geometry, F32, F32]:
     """Views over half a turn in bit-reversed order, their geometry, frames of the open beam, and the truth."""
-    rng, phantom = np.random.default_rng(seed), sample(25)
+    rng, phantom = np.random.default_rng(0), sample(25)
     order = np.argsort([int(f"{k:012b}"[::-1], 2) for k in range(n)], kind="stable")
     geometry = Geometry.parallel(order * np.pi / n, (ROWS, cols), pixel_pitch=PITCH)
     detector = Detector.centred((3 * ROWS, 3 * cols), PITCH / 3)
@@ -47,11 +50,15 @@ def scan(n: int, photons: float, seed: int = 0, cols: int = SIDE) -> tuple[F32, 
     return views, geometry, open_beam, phantom.attenuation(Grid.matching(geometry))
 
 
-def law_of(n: int, photons: float) -> tuple[ErrorLaw, float | None]:
+def measured(n: int, photons: float) -> tuple[ErrorLaw, float | None]:
     views, geometry, open_beam, _ = scan(n, photons)
     return measured_law(views, geometry, [n // 2, n], np.random.default_rng(1), open_beam)
 
 
+law_of = cache(measured)
+
+
+@cache
 def true_gain(n: int, photons: float) -> float:
     """dB from half of the views to all, by FISTA-TV."""
     views, geometry, _, truth = scan(n, photons)
@@ -77,7 +84,7 @@ def test_views_at_the_same_angles_bring_less_than_others() -> None:
     assert 0 < law.gain(again=32).mean < law.gain(views=32).mean
 
 
-@pytest.mark.parametrize(("n", "photons"), [(96, 300), (192, 300), (192, 3000)])
+@pytest.mark.parametrize(("n", "photons"), others_slow([(96, 300), (192, 300), (192, 3000)], 2))
 def test_the_gain_of_the_last_pass_is_measured_apart_from_the_law(n: int, photons: float) -> None:
     _, gained = law_of(n, photons)
     assert gained == pytest.approx(true_gain(n, photons), abs=0.8)
@@ -134,13 +141,13 @@ def test_views_of_many_columns_are_binned(monkeypatch: pytest.MonkeyPatch) -> No
         return balance_of(problem, start, sweeps)
 
     monkeypatch.setattr(NoiseBalance, "of", noted)
-    binned = law_of(192, 300)[0]
+    binned = measured(192, 300)[0]
     assert columns == [SIDE // 2]
     assert binned.n_views == 192 and binned.exponent == pytest.approx(whole.exponent, abs=0.15)
 
 
 def test_the_same_seed_gives_the_same_law() -> None:
-    assert law_of(64, 300) == law_of(64, 300)
+    assert measured(64, 300) == measured(64, 300)
 
 
 def test_what_cannot_be_measured_is_refused() -> None:

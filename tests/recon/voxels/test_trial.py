@@ -26,6 +26,7 @@ from recon.voxels.priors import pnp_dct
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
+from tests.slow_cases import others_slow
 
 VIEWS, ROWS, COLS, PHOTONS = 40, 16, 64, 1000
 
@@ -46,7 +47,7 @@ def foam() -> tuple[F32, Geometry, Grid, F32]:
     return -np.log(counts / PHOTONS).astype(np.float32), geometry, grid, (scale * truth).astype(np.float32)
 
 
-@pytest.mark.parametrize("method", [FistaTv(), OsSirtTv()], ids=lambda m: m.name)
+@pytest.mark.parametrize("method", others_slow([FistaTv(), OsSirtTv()]), ids=lambda m: m.name)
 def test_a_texture_survives(
     foam: tuple[F32, Geometry, Grid, F32], method: recon.Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:

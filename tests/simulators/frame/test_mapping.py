@@ -84,7 +84,7 @@ def test_a_number_is_finite(value: Any) -> None:
         ({"table": [[1, 2], [1]]}, "outer.table.1 is [1]; expected a list of 2: a number"),
         ({"table": [[1, 2], [1, "x"]]}, "outer.table.1.1 is 'x'; expected a number"),
         ({"shares": [1]}, "outer.shares is [1]; expected a group of keys: any"),
-        ({"shares": {"third": 1}}, "outer.shares.third: key must be a valid integer"),
+        ({"shares": {"third": 1}}, "outer.shares.third: key must be a whole number"),
         ({"shares": {3: "x"}}, "outer.shares.3 is 'x'; expected a number"),
         ({"inner": 60}, "outer.inner is 60; expected a group of keys: kv, filters"),
         ({"inner": {}}, "outer.inner.kv is missing; expected a number"),

@@ -14,7 +14,7 @@ import tifffile
 
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import opened_volume, write_volume
-from tests.beamline.cli.small_scan import beamline, left
+from tests.beamline.cli.small_scan import beamline
 
 VALUES = np.linspace(-0.1, 1.1, 60, dtype=np.float32).reshape(3, 4, 5)
 
@@ -58,27 +58,6 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "code", "said"),
-    [
-        (["-o", "v.png"], 2, "'.png' is not known"),
-        (["-o", "v.h5"], 2, "VOLUME and --output are the same"),
-        (["-o", "no/v.tif"], 5, "does not exist"),
-        (["-o", "g.tif", "--bits", "8"], 2, "lie in"),
-        (["-o", "g.tif", "--window", "0:1"], 2, "needs --bits 8"),
-        (["-o", "g.tif", "--bits", "8", "--window", "1:0"], 2, "LOW below HIGH"),
-        (["-o", "g.tif", "--bits", "8", "--window", "0:nan"], 2, "not a window"),
-        (["-o", "g.h5", "--bits", "8", "--window", "0:1"], 2, "leave out --bits"),
-    ],
-)
-def test_refused_with_one_sentence_and_nothing_left(volume: Path, options: list[str], code: int, said: str) -> None:
-    before = left(volume)
-    result = beamline("export", "v.h5", *options)
-    assert result.exit_code == code, result.output
-    assert said in result.stderr and result.stdout == ""
-    assert left(volume) == before
-
-
-@pytest.mark.parametrize(
     ("values", "said"),
     [
         ([], "Every value of the slices looked at is 0: there is no window"),
@@ -113,6 +92,3 @@ def test_a_folder_of_slices_of_another_program_is_a_volume(folder: Path) -> None
         "rec_12.tif is float32 (4, 9); expected slices [y, x] of one type and shape"
         in beamline("export", "slices", "-o", "w.npy").stderr
     )
-    (folder / "empty").mkdir()
-    assert "empty is a folder without TIFF slices" in beamline("export", "empty", "-o", "w.npy").stderr
-    assert "none does not exist" in beamline("export", "none", "-o", "w.npy").stderr

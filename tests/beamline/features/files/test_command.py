@@ -144,27 +144,6 @@ def test_sigterm_leaves_no_part_of_an_ingest(folder: Path, monkeypatch: pytest.M
     assert {path.name for path in folder.iterdir()} == before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("in.tif", "out.h5"), "angles"),
-        (("in.tif", "no/out.h5", "--angles", "angles.txt"), "does not exist"),
-        (("in.tif", "scan.h5", "--angles", "angles.txt"), "exists"),
-        (("missing.tif", "out.h5"), "missing.tif"),
-        (("in.tif", "out.h5", "--angles", "angles.txt", "--angle-rows", "0:99"), "0:99"),
-        (("angles.txt", "out.h5"), "angles.txt"),
-    ],
-)
-def test_ingest_failures_leave_nothing(folder: Path, arguments: tuple[str, ...], said: str) -> None:
-    _stack(folder)
-    before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    result = beamline("ingest", *arguments)
-    assert result.exit_code == 5, result.output
-    assert said in result.stderr
-    assert "Traceback" not in result.output
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
 def test_validate_deep_names_damaged_frames(folder: Path) -> None:
     good = beamline("validate", "scan.h5", "--deep")
     assert (good.exit_code, good.stdout.splitlines()) == (0, ["scan.h5: 0 errors, 0 warnings"])
@@ -183,5 +162,3 @@ def test_info_prints_and_draws_statistics_of_a_raw_scan(tmp_path: Path) -> None:
     assert result.exit_code == 0
     assert [line.split()[0] for line in result.stdout.splitlines()] == ["kind", "dark", "flat", "projection", "output"]
     assert (tmp_path / "h.png").read_bytes().startswith(b"\x89PNG")
-    for wrong in (["-o", "x.png"], ["--statistics", "--truth", "t.npy"]):
-        assert beamline("info", scan, *wrong).exit_code == 2

@@ -16,7 +16,6 @@ from beamline.storage.volumes.base import bare_record
 from beamline.storage.writers.recon_file import write_reconstruction
 from recon.base.volume import Grid, Volume
 from tests.beamline.cli.small_scan import beamline, left
-from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 from tests.recon.post.phantom import BALLS, can
 
 VOXEL, CENTRE = 0.01, (0.5, -0.2, 0.3)  # mm
@@ -134,30 +133,6 @@ def test_touching_balls_are_one_without_a_neck(here: Path) -> None:
     np.save(here / "can.npy", can())
     result = beamline("segment", "can.npy", *MARGIN, "--neck", "0")
     assert f"{len(WHOLE) - 1}, 0 of them cut" in result.stdout, result.output
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "said"),
-    [
-        (("even.npy",), 5, "cannot be segmented"),
-        (("holes.npy",), 5, "not finite"),
-        (("flat.npy",), 5, "expected real numbers"),
-        (("scan.h5",), 5, "is a scan"),
-        (("can.npy", "--percentiles", "90", "10"), 5, "rise"),
-        (("can.npy", "--clusters", "1"), 2, "--clusters"),
-        (("can.npy", "-o", "labels.csv"), 2, "labels.csv"),
-    ],
-)
-def test_bad_input_leaves_nothing(here: Path, arguments: tuple[str, ...], code: int, said: str) -> None:
-    np.save(here / "can.npy", can()[:6])
-    np.save(here / "even.npy", np.ones((4, 5, 6)))
-    np.save(here / "holes.npy", np.full((4, 5, 6), np.nan))
-    np.save(here / "flat.npy", np.ones((5, 6)))
-    write_flagged(here / "scan.h5", frames_of(TwoCylinders()), {})
-    before = left(here)
-    result = beamline("segment", *arguments)
-    assert result.exit_code == code, result.output
-    assert said in result.stderr and left(here) == before
 
 
 @pytest.mark.usefixtures("undrawn")

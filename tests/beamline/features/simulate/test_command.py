@@ -168,13 +168,6 @@ def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monk
     assert beamline("simulate", "scene.yaml", "--truth", "t.h5", "--truth-bin", "2").exit_code == 0
 
 
-def test_what_a_cone_s_source_touches_is_refused_in_words(folder: Path) -> None:
-    result = beamline("simulate", "scene.yaml", "--out", "s.h5", "--set", "beam.sod=0.1", "--set", "beam.sdd=1")
-    assert result.exit_code == 2
-    assert "scene.yaml cannot be exposed: solid 0 (ellipsoid) reaches" in result.stderr
-    assert not Path("s.h5").exists()
-
-
 def test_the_energy_of_the_beam_is_in_the_file(folder: Path) -> None:
     wanted = ("--frames", "1", "--set", "beam.energy_kev=20.5")
     assert beamline("simulate", "scene.yaml", "--out", "s.h5", *wanted).exit_code == 0
@@ -188,32 +181,6 @@ def test_a_coarser_truth_tells_the_bin_that_it_is_for(folder: Path) -> None:
     shape = "--truth has shape (8, 10, 10), the volume (16, 20, 20) [z, y, x] with --bin 2. Give --bin 4."
     refused = beamline("recon", "s.h5", "-m", "fbp", "--axis", "21", "--bin", "2", "--truth", "t.h5", "-o", "r.h5")
     assert (refused.exit_code, shape in refused.stderr) == (2, True), refused.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (("nowhere", "--explain"), 2, "There is no file nowhere, and scene 'nowhere' is unknown; legal: battery, "),
-        (("scene.yaml",), 2, "Nothing to do. Give --explain"),
-        (("broken.yaml", "--explain"), 2, "scene.beam.photons is not a known key"),
-        (("scene.yaml", "--truth", "t.h5", "--truth-bin", "64"), 2, "--truth-bin: "),
-        (("scene.yaml", "--out", "new.h5", "--set", f"effects=[{FRINGES}]"), 2, "the wave would alias"),
-        (("scene.yaml", "--out", "there.h5", "--truth", "t.h5"), 5, "there.h5 exists"),
-        (("scene.yaml", "--out", "new.png"), 2, "new.png would be both the scan and the picture"),
-        (("scene.yaml", "--out", "new.h5", "--truth", "./new.h5"), 2, "new.h5 would be both the scan and the truth"),
-        (("scene.yaml", "--out", "nowhere/new.h5"), 5, "new.h5 cannot be written there. Create it first"),
-        (("scene.yaml", "--explain", "--truth-bin", "2"), 2, "--truth-bin needs --truth FILE"),
-        (("scene.yaml", "--out", "new.h5", "--seed", str(2**64)), 2, "--seed"),
-        (("scene.yaml", "--out", "new.h5", "--picture", "there.h5"), 5, "there.h5 exists"),
-    ],
-)
-def test_refused_before_anything_is_written(folder: Path, arguments: tuple[str, ...], code: int, words: str) -> None:
-    Path("there.h5").write_bytes(b"")
-    Path("broken.yaml").write_text("phantom: {kind: solids, solids: []}\nbeam: {photons: 1}\n", encoding="utf-8")
-    before = left(folder)
-    result = beamline("simulate", *arguments)
-    assert (result.exit_code, words in result.stderr) == (code, True), result.stderr
-    assert left(folder) == before
 
 
 @pytest.mark.parametrize("name", [*shipped_scenes()])

@@ -18,7 +18,7 @@ from beamline.features.trials.run_trial import TrialData, averaged
 from beamline.features.trials.trial import MethodTrial, Outcome
 from recon.base.volume import Grid, Volume
 from recon.judgement import contrast
-from tests.beamline.cli.small_scan import beamline, left
+from tests.beamline.cli.small_scan import beamline
 from tests.beamline.html_page import parsed_page
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -133,21 +133,3 @@ def test_ctrl_c_leaves_the_rows_done_and_says_so(
     done = [row["row"] for row in _rows(folder / "out") if row["status"] == "done"]
     assert done == ["fixed, 90 views", "random, 90 views, draw 1"]
     assert (folder / "out" / "report.html").is_file() and not (folder / "out" / "work").exists()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "said"),
-    [
-        (("magic", "scan.h5"), 2, "magic"),
-        (("sector", "scan.h5", "-m", "magic"), 2, "magic"),
-        (("sector", "scan.h5", "--truth", "missing.npz"), 2, "missing.npz"),
-        (("sector", "scan.h5", "-m", "fbp", "--steps", "5"), 2, "no row is by one of these"),
-        (("sector", "scan.h5", "--seconds", "3", "--steps", "5"), 2, "--steps does not go with --seconds"),
-        (("fixed-views", "scan.h5"), 5, "30 views are too few"),
-    ],
-)
-def test_bad_input_leaves_nothing(folder: Path, arguments: tuple[str, ...], code: int, said: str) -> None:
-    result = beamline("study", *arguments)
-    assert result.exit_code == code, result.output
-    assert said in result.stderr and result.stdout == ""
-    assert left(folder) == {"scan.h5"}

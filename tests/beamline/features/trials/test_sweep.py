@@ -72,27 +72,6 @@ def test_a_grid_of_two_options_finds_the_axis_with_a_method_that_explains_views(
     assert "The best iterations" not in result.stdout and "axis 20.7, iterations 15" in result.stdout
 
 
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        ("scan.h5", "give a scan, and an option"),
-        ("rings=none,vo", "give a scan, and an option"),
-        ("scan.h5 ring=none,vo", "did you mean rings?"),
-        ("scan.h5 rings=none,voo", "did you mean vo?"),
-        ("scan.h5 tv-weight=1,2", "is of fista-tv, os-sirt-tv; give --method"),
-        ("scan.h5 filter=hann,ram-lak -m sirt", "filter changes nothing of a slice by sirt"),
-        ("scan.h5 rings=none,vo --rings vo", "--rings is swept"),
-        ("scan.h5 rings=none,vo --truth t.npz", "--truth belongs to a volume"),
-        ("scan.h5 allow-negative=no,yes -m sirt", "expected allow-negative=false,true"),
-        ("scan.h5 rings=none,vo -o scan.h5", "scan.h5"),
-    ],
-)
-def test_nonsense_is_refused_at_once(folder: Path, words: str, why: str) -> None:
-    result = beamline("sweep", *words.split())
-    assert result.exit_code == 2 and why in " ".join(result.stderr.split())
-    assert left(folder) == {"scan.h5"}
-
-
 @pytest.mark.parametrize("slices", [0, 2])
 def test_an_interrupt_keeps_the_slices_that_are_done(
     folder: Path, monkeypatch: pytest.MonkeyPatch, slices: int

@@ -62,22 +62,3 @@ def test_ctrl_c_is_exit_code_4_with_a_table(
     assert "after 2 of" in result.stderr
     assert "fbp, 27 views" in result.stdout and "interrupted" in result.stdout and "not run" in result.stdout
     assert {"tradeoff.csv", "tradeoff.html"} < left(folder / "out")
-
-
-@pytest.mark.parametrize(
-    ("options", "code", "said"),
-    [
-        (["--methods", "r2,magic"], 2, "magic"),
-        (["--views", "fixed:31"], 2, "30"),
-        (["--truth", "missing.npz"], 2, "missing.npz"),
-        (["--seconds", "nan"], 2, "finite"),
-        (["--seed", "-1"], 2, "--seed"),
-        (["-o", "scan.h5"], 2, "scan.h5"),
-    ],
-)
-def test_bad_input_leaves_nothing(folder: Path, options: list[str], code: int, said: str) -> None:
-    result = beamline("tradeoff", "scan.h5", *options)
-    assert result.exit_code == code, result.output
-    assert said in result.stderr
-    assert result.stdout == ""
-    assert left(folder) == {"scan.h5"}

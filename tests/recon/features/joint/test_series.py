@@ -16,17 +16,10 @@ from recon.base.volume import Grid
 from recon.features.joint.proportions import SOLUTION_STEPS
 from recon.features.joint.series import TimedViews, TimedVolumes, fit_series, hats, of_moments
 from recon.voxels.projector import Projector
+from tests.refused_calls import refused_calls
 
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 40, endpoint=False), (2, 8), pixel_pitch=1.0)
 ONES = np.ones((40, 2, 8), np.float32)
-
-
-@pytest.mark.parametrize(
-    ("data", "weights"), [(0 * ONES, None), (np.nan * ONES, None), (ONES, 0 * ONES)], ids=["zero", "NaN", "no weight"]
-)
-def test_views_without_matter_are_refused(data: np.ndarray, weights: np.ndarray | None) -> None:
-    with pytest.raises(ValueError, match="show no matter"):
-        recon.reconstruct(data, VIEWS, recon.TimeSeries(), use=recon.DataUse(weights))
 
 
 SIDE, ROWS = 40, 2
@@ -216,18 +209,6 @@ def test_a_stop_within_a_sweep_gives_volumes(asked: int) -> None:
     assert len(calls) < asked + 8
 
 
-@pytest.mark.parametrize("knots", [1, 3])
-def test_too_few_and_too_many_volumes_are_refused(knots: int) -> None:
-    with pytest.raises(ValueError, match="2 volumes"):
-        fit_series(views_of(24), knots)
-
-
-@pytest.mark.parametrize("times", [np.zeros(24), np.arange(23.0), np.full(24, np.nan)])
-def test_times_that_say_nothing_are_refused(times: F64) -> None:
-    with pytest.raises(ValueError, match="one a view"):
-        replace(views_of(24), times=times)
-
-
 def test_a_gap_with_too_few_views_for_a_volume_is_refused() -> None:
     views = views_of(60)
     gap = replace(views, times=np.where(views.times < 3, views.times, views.times + 20))
@@ -248,3 +229,6 @@ def test_each_part_of_a_scan_with_a_moment_a_view_sees_all_times_and_directions(
             assert np.diff(np.r_[-1, own, 72]).max() <= 72 / 3
             angles = np.sort(np.mod(views.geometry.angles[own], np.pi))
             assert np.diff(np.r_[angles, angles[0] + np.pi]).max() < np.pi / 3
+
+
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -27,6 +26,7 @@ from simulators.samples.bodies.solids import (
     plate,
     truncated_octahedron,
 )
+from tests.refused_calls import refused_calls
 from tests.simulators import bodies
 from tests.simulators.bodies import SOLIDS, inside
 
@@ -183,30 +183,4 @@ def test_quaternions_may_have_any_length(length: float) -> None:
     np.testing.assert_allclose(scaled.faces, turned.faces, atol=1e-3 if length < 1e-300 else 1e-15)
 
 
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: Cylinder(0.0, 1.0, 1.0), "cylinder: radius must be positive in mm, got 0.0"),
-        (lambda: Ellipsoid((0.1, -0.1, 0.1), 1.0), "ellipsoid: semi_axes must be"),
-        (lambda: Box((0.1, 0.1, math.nan), 1.0), "box: edges must be"),
-        (lambda: Box((0.1, 0.1, 0.1), 1.0, quaternion=(0, 0, 0, 0)), "finite and not all zero"),
-        (lambda: Box((0.1, 0.1, 0.1), 1.0, quaternion=(math.nan, 0, 0, 0)), "finite and not all zero"),
-        (lambda: Ellipsoid((1e-308, 0.1, 0.1), 1.0), r"semi_axes must lie in 1e-09 \.\.\. 1e\+09 mm, got \(1e-308"),
-        (lambda: Cylinder(0.1, 0.1, 1.0, (0, -1e10, 0)), r"centre must lie within 1e\+09 mm"),
-        (lambda: Cylinder(0.1, 0.1, 1.0, (0, math.nan, 0)), "must be finite"),
-        (lambda: Ellipsoid((0.1, 0.1, 0.1), 1e300), r"attenuation must lie within 1e\+12 1/mm"),
-        (lambda: Polyhedron(_sized(1e300), 1.0), r"size must lie in 1e-09 \.\.\. 1e\+09 mm, got 3e\+299"),
-        (lambda: Polyhedron(_sized(1e-200), 1.0), "size must lie in"),
-        (lambda: Polyhedron(bodies.CORNERS, math.nan), "polyhedron: attenuation nan"),
-        (lambda: Polyhedron(tuple(CUBE[:3]), 1.0), "vertices must be 4 or more, finite"),
-        (lambda: Polyhedron((*CUBE[:4], (0, 0, np.inf)), 1.0), "vertices must be 4 or more, finite"),
-        (lambda: Polyhedron(tuple(CUBE[:4]), 1.0), "its 4 vertices lie in a plane"),
-        (lambda: Polyhedron(((0, 0, 0), (1, 1, 1), (2, 2, 2), (5, 5, 5)), 1.0), "lie in a plane"),
-        (lambda: Polyhedron((*CUBE, (0.1, 0.2, 0.3)), 1.0), r"vertex 8 at \(0.1, 0.2, 0.3\) mm is not a corner"),
-        (lambda: Polyhedron((*CUBE, (1, 1, 0)), 1.0), "vertex 8 at .* leave it out"),
-        (lambda: Polyhedron(((0, 0, 1), *CUBE), 1.0), r"vertex 0 at \(0, 0, 1\)"),
-    ],
-)
-def test_impossible_solids_are_refused(make: Callable[[], Solid], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        make()
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from recon.base.volume import Grid
-from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
-from simulators.light import Beam
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Box, Ellipsoid, Polyhedron
-from simulators.samples.composed import ELECTROLYTE, PARTICLE, battery, build_sample
+from simulators.samples.composed import ELECTROLYTE, PARTICLE, battery
+from tests.refused_calls import refused_calls
 from tests.simulators.bodies import volume
 
 
@@ -53,12 +50,4 @@ def test_battery_repeats_with_its_seed_and_refuses_what_does_not_fit() -> None:
         battery(np.random.default_rng(4), n_particles=50, fill=0.9)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ({"field_of_view": [0.0, 1.0]}, r"field_of_view.0 is 0.0; expected a number >"),
-    ],
-)
-def test_wrong_settings_are_refused(wrong: dict[str, Any], words: str) -> None:
-    with pytest.raises(SceneError, match=words):
-        build_sample("phantom", {"kind": "battery", "field_of_view": [1.0, 1.0]} | wrong, Beam(1e5))
+test_calls_that_are_refused = refused_calls(__file__, globals())

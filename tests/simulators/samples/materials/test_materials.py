@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import xraylib
@@ -11,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from simulators.frame.mapping import SceneError
 from simulators.samples.materials.materials import (
     FAR,
     K_EDGES,
@@ -26,6 +23,7 @@ from simulators.samples.materials.materials import (
     palette_of,
     profile,
 )
+from tests.refused_calls import refused_calls
 
 ENERGIES = np.array([2.0, 8.0, 8.5, 25.0, 60.0, 300.0])
 
@@ -93,31 +91,6 @@ def test_the_shift_of_the_edge_may_be_named() -> None:
         for charge, shift in ((1.0, 4.0), (0.5, 4.0), (0.0, 4.0), (0.0, None))
     ]
     np.testing.assert_allclose(tops, [8.3485, 8.3465, 8.3445, 8.3465], atol=5e-5)
-
-
-@pytest.mark.parametrize(
-    ("density", "charge", "shift", "words"),
-    [
-        (0.0, None, None, "density must lie between 0 and 100 g/cm3, got 0.0"),
-        (5.0, 1.5, None, r"state_of_charge must lie in 0 ... 1, got 1.5"),
-        (5.0, 0.5, None, "an oxide with Mn, Co, Ni; this has none of them"),
-        (5.0, 0.5, 20.5, r"edge_shift_ev must lie in -20 ... 20 eV, got 20.5"),
-        (5.0, 0.5, -400.0, "edge_shift_ev must lie in"),
-        (5.0, None, 2.0, "edge_shift_ev needs a state_of_charge"),
-    ],
-)
-def test_impossible_materials_are_refused(
-    density: float, charge: float | None, shift: float | None, words: str
-) -> None:
-    with pytest.raises(ValueError, match=words):
-        Material("it", density, ((13, 1.0),), charge, shift)
-
-
-def test_unknown_formulas_and_untabulated_energies_are_refused() -> None:
-    with pytest.raises(ValueError, match="unknown symbol Xx"):
-        of_formula("it", "Xx2O", 1.0)
-    with pytest.raises(ValueError, match=r"from 0.1 to 800"):
-        of_formula("it", "Al", 2.7).attenuation([8.0, 900.0])
 
 
 Reals = NDArray[np.float64]
@@ -229,28 +202,4 @@ def test_a_scene_changes_and_adds_materials() -> None:
     np.testing.assert_array_equal(colours.filters("Al")(20.0), colours("Al").attenuation(20.0))
 
 
-@pytest.mark.parametrize(
-    ("entry", "words"),
-    [
-        ([], r"materials must be a mapping from names to the properties of materials; got \[\]"),
-        ({"NMC811": 3}, "materials.NMC811 is 3; expected a group of keys"),
-        (
-            {"NMC811": {"charge": 1}},
-            "materials.NMC811.charge is not a known key; legal keys there: formula",
-        ),
-        ({"NMC811": {"state_of_charge": 2}}, "materials.NMC811: NMC811: state_of_charge must lie in 0 ... 1, got 2.0"),
-        ({"Al": {"state_of_charge": 1}}, "this has none of them"),
-        ({"glue": {"density": 1.1}}, "materials.glue: 'glue' is not a known material; give formula and density"),
-        ({"glue": {"formula": "C2H4"}}, "materials.glue: 'glue' is not a known material; give formula and density"),
-        ({"glue": {"formula": "Qq", "density": 1}}, "materials.glue: Invalid chemical formula"),
-        ({"glue": {"formula": "C", "density": -1}}, "density must lie between 0 and 100"),
-    ],
-)
-def test_an_impossible_material_is_refused(entry: Any, words: str) -> None:
-    with pytest.raises(SceneError, match=words):
-        palette_of("materials", entry)
-
-
-def test_an_unknown_name_is_told_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"'mud'.*NMC"):
-        palette_of("materials", {"glue": {"formula": "C2H4", "density": 1.1}})("mud")
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -16,7 +16,6 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from recon.base.volume import Grid
-from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
 from simulators.light import Beam
 from simulators.samples.bodies.phantom import Phantom
@@ -26,6 +25,7 @@ from simulators.samples.materials.parts import Mixture, Part, effective_depth, s
 from simulators.samples.materials.spectrum import Attenuation
 from simulators.samples.sample import Sample
 from simulators.scenes.scene import load_scene
+from tests.refused_calls import refused_calls
 
 LIQUID, OXIDE = of_formula("liquid", "C3H6O3", 1.3), of_formula("oxide", "LiCoO2", 5.05)
 BATH = Cylinder(0.1, 0.3, 1.0)
@@ -124,15 +124,6 @@ def test_labels_and_radius_are_those_of_the_parts() -> None:
     assert sample.labels(z)[0, 0].tolist() == [1, 1, 2]
 
 
-def test_materials_are_refused_in_a_beam_without_energies_or_of_impossible_ones() -> None:
-    with pytest.raises(ValueError, match="beam's"):
-        _seen(PARTS)
-    with pytest.raises(ValueError, match=r"from 0.1 to 800"):
-        _seen(PARTS, energy_kev=900.0)
-    with pytest.raises(ValueError, match="instead_of 'liquid'"):
-        Part(BATH, instead_of=LIQUID)
-
-
 POOL = {"kind": "cylinder", "radius": 0.1, "height": 0.3, "material": "electrolyte"}
 OXIDE_GRAIN = {
     "kind": "ellipsoid", "semi_axes": [0.01, 0.01, 0.01], "material": "NMC811", "instead_of": "electrolyte",
@@ -175,35 +166,6 @@ def test_tables_are_loaded_only_where_a_material_is_named() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize(
-    ("solids", "light", "words"),
-    [
-        ([POOL], {}, r"scene.phantom \(solids\): materials need the beam's energy"),
-        (
-            [POOL | {"attenuation": 1.0}],
-            {"energy_kev": 8},
-            r"solids\[0\]: attenuation and material exclude each other",
-        ),
-        ([POOL, GREY | {"material": "mud"}], {"energy_kev": 8}, r"solids\[1\]: attenuation and material"),
-        ([POOL | {"material": "mud"}], {"energy_kev": 8}, r"solids\[0\]: material 'mud' is unknown"),
-        ([POOL | {"material": 5}], {"energy_kev": 8}, r"solids\[0\]: material must be text"),
-        ([GREY | {"name": 5}], {}, r"solids\[0\]: name must be text, got"),
-        ([POOL, GREY | {"instead_of": "Al"}], {"energy_kev": 8}, "instead_of 'Al' needs a material"),
-        ([POOL, "box"], {"energy_kev": 8}, r"solids\[1\] \(box\).edges is missing"),
-        ([POOL | {"colour": 1}], {"energy_kev": 8}, r"solids\[0\] \(cylinder\).colour is not a known key"),
-        ([POOL], {"energy_kev": 900}, "tabulated from 0.1 to 800 keV"),
-        (
-            [POOL],
-            {"tube": {"kv": 60, "filters": {"mud": 1}}},
-            r"scene.phantom \(solids\): material 'mud' is unknown",
-        ),
-    ],
-)
-def test_what_cannot_be_seen_is_refused(solids: list[Any], light: dict[str, Any], words: str) -> None:
-    with pytest.raises(SceneError, match=words):
-        _sample(*solids, **light)
-
-
 Reals = NDArray[np.float64]
 
 
@@ -238,3 +200,6 @@ def test_many_rows_are_shared_out_and_come_out_the_same() -> None:
     mu, weights = np.array([[3.0, 1.0], [1.0, 2.0]]), np.array([0.4, 0.6])
     expected = -np.log(np.tensordot(weights, np.exp(-np.tensordot(mu, thickness, 1)), 1))
     np.testing.assert_allclose(effective_depth(thickness, mu, weights), expected, rtol=1e-12)
+
+
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from scipy.ndimage import map_coordinates
 from recon.base.volume import Grid
 from simulators.frame.shot import Detector, Pose
 from simulators.samples.voxels.voxels import Voxels
+from tests.refused_calls import refused_calls
 
 SHAPE, SPACING = (7, 9, 11), (0.05, 0.04, 0.03)
 
@@ -184,20 +184,4 @@ def test_threads_change_nothing(random: Voxels, monkeypatch: pytest.MonkeyPatch)
         assert alone.any()
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"attenuation": np.zeros((3, 3))}, "three axes"),
-        ({"spacing": 0.0}, "positive size"),
-        ({"spacing": (0.1, 1e-308, 0.1)}, r"must be 1e-09 \.\.\. 1e\+09 mm in size"),
-        ({"attenuation": np.full((2, 2, 2), np.nan)}, "not finite"),
-        ({"thresholds": [2.0, 1.0]}, "ascend"),
-        ({"labels": np.zeros((1, 2, 2), int)}, "do not go with"),
-        ({"labels": np.full((2, 2, 2), 256)}, "0 ... 255"),
-        ({"labels": np.zeros((2, 2, 2), int), "thresholds": [1.0]}, "not from both"),
-        ({"thresholds": [1.0, 2.0], "names": ("one",)}, "as many names"),
-    ],
-)
-def test_wrong_volumes_are_refused(wrong: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Voxels.of(**{"attenuation": np.zeros((2, 2, 2)), "spacing": 0.1, **wrong})
+test_calls_that_are_refused = refused_calls(__file__, globals())

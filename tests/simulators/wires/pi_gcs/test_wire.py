@@ -14,6 +14,7 @@ from simulators.devices.clock import VirtualClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.pi_gcs.wire import PiGcsBuild
 from tests.drivers.stages.flat_settings import flat
+from tests.simulators.wires.dialogue import play, played
 
 TURN = 360_000
 """A thousand counts a degree."""
@@ -53,22 +54,30 @@ class Wire:
         assert self.box.transmit() == b""
         return int(self.ask("ERR?"))
 
+    def rest(self) -> None:
+        """Let an hour pass; nothing may have been refused."""
+        self.clock.sleep(3600.0)
+        assert self.ask("ERR?") in ("0", "10")
+
     def window(self, step: str, start: str, stop: str) -> None:
         """Degrees; and switched on."""
         self.tell("TRO 1 0", "CTO 1 2 1", "CTO 1 3 0", f"CTO 1 1 {step}", f"CTO 1 8 {start}", f"CTO 1 9 {stop}")
         assert self.complains("TRO 1 1") == 0
 
     def run(self, *commands: str) -> None:
-        """Give commands and let an hour pass; none of them may be refused."""
+        """Give commands and let an hour pass."""
         self.tell(*commands)
-        self.clock.sleep(3600.0)
-        assert self.ask("ERR?") in ("0", "10")
+        self.rest()
 
     def pulses(self) -> list[EmittedPulse]:
         return emitted(self.line, self.clock)
 
-    def degrees(self) -> list[float]:
-        """Where the pulses were."""
+    def at(self, time: float) -> float:
+        """Degrees."""
+        return math.degrees(self.line.angle_at(time))
+
+    def places(self) -> list[float]:
+        """Where the pulses were, in degrees."""
         return [round(math.degrees(pulse.angle), 6) for pulse in self.pulses()]
 
 
@@ -88,55 +97,60 @@ def crossing(degrees: float) -> float:
     return VELOCITY / ACCELERATION + (degrees - RAMP) / VELOCITY
 
 
-def test_turning_round_inside_the_window_goes_on_giving_pulses_until_it_is_left(wire: Wire) -> None:
-    """Out to 4.5 (pulses at 2, 3, 4), back to 2.5 (3), forwards again (4, 5), then out past the stop: none more."""
-    wire.window("1", "2", "5.5")
-    wire.run("MOV 1 4.5")
-    wire.run("MOV 1 2.5")
-    wire.run("MOV 1 9")
-    wire.run("MOV 1 3")
-    assert wire.degrees() == [2, 3, 4, 3, 4, 5]
+# Replies: 0xb0 and 0xb1 are ° and ± in the controller's code page.
+DIALOGUES: dict[str, tuple[dict[str, Any], str]] = {
+    "turning round inside the window goes on giving pulses until it is left": (
+        {}, "window 1 2 5.5; MOV 1 4.5; ~; MOV 1 2.5; ~; MOV 1 9; ~; MOV 1 3; ~; @ 2 3 4 3 4 5"
+    ),
+    "leaving backwards ends it and coming again begins anew": (
+        {}, "window 1 2 5.5; MOV 1 3.5; ~; MOV 1 0; ~; MOV 1 4.5; ~; @ 2 3 2 2 3 4"
+    ),
+    "switched on inside the window it counts from where it stands": (
+        {}, "MOV 1 2.2; ~; window 1 2 5.5; MOV 1 9; ~; @ 3.2 4.2 5.2"
+    ),
+    "switched off, in another mode or on another output there is nothing": (
+        {},
+        "window 1 2 5.5; TRO 1 0; MOV 1 9; ~; @; MOV 1 0; ~; window 1 2 5.5; CTO 1 3 2; MOV 1 9; ~; @; MOV 1 0; "
+        "TRO 1 0; CTO 2 1 1; CTO 2 8 2; CTO 2 9 5.5; TRO 2 1; ~; MOV 1 9; ~; @; TRO? -> 1=0 /2=1 /3=0 /4=0",
+    ),
+    "at 10 degrees/s a step of 0.01 takes 1 ms: pulses that are longer merge": (
+        {"pulse_width": 1.001e-3}, "window 0.01 5 6.005; MOV 1 20; ~; # 1"
+    ),
+    "and shorter ones do not": ({"pulse_width": 0.999e-3}, "window 0.01 5 6.005; MOV 1 20; ~; # 101"),
+    "lost pulses are missing and no others": ({"lost": {0, 3}}, "window 1 2 7.5; MOV 1 20; ~; @ 3 4 6 7"),
+    "a motion error ends the pulses": ({"stall_at": 4500}, "window 1 2 7.5; MOV 1 20; ~ 60; @ 2 3 4"),
+    "replies have the documented form": (
+        {},
+        "~ 0.1; *IDN? -> *Physik Instrumente*C-863.12*; CSV? -> 2.0; SAI? -> 1; SAI? ALL -> 1; POS? 1 -> 1=0.000000; "
+        "POS? -> 1=0.000000; SVO? 1 -> 1=1; FRF? 1 -> 1=1; VEL? 1 -> 1=10.000000; SPA? 1 0xE -> 1 0xE=360000.000000; "
+        "SPA? 1 15 -> 1 0xF=360.000000; CTO? 1 3 -> 1 3=0; TRO? 1 -> 1=0; \x04 -> 0x9002",
+    ),
+    "the last error wins": ({}, "MOV 1 9999; XYZ; ERR? -> 2"),
+    "acceleration and deceleration are two things: up 0.5 s and 2.5 degrees, down 2 s and 10 degrees": (
+        {}, "DEC 1 5; MOV 1 30; ~ 4.249; \x05 -> 1; ~ 0.002; \x05 -> 0; at 2.25 -> 20; at 3.25 -> 27.5"
+    ),
+    "a relative move goes from the last target": ({}, "MOV 1 3; ~; MVR 1 -4.5; ~; POS? 1 -> 1=-1.500000"),
+    "the position read is one servo cycle old": (
+        {"servo_period": 0.01}, "MOV 1 100; ~ 2; POS? 1 -> 1=17.400000"
+    ),
+    "a stage without switches says so": (
+        {"reference_switch": False, "limit_switches": False},
+        "TRS? 1 -> 1=0; LIM? 1 -> 1=0; FRF 1; ERR? -> 31; FNL 1; ERR? -> 32; FPL 1; ERR? -> 32",
+    ),
+    **{
+        f"a reference move finds the true zero: {command}": (
+            {"referenced": False, "found_at": -4.0, "low": -20, "high": 30},
+            f"POS? 1 -> 1=0.000000; at 0 -> -4; {command} 1; \x05 -> 1; \x07 -> °; FRF? 1 -> 1=0; \x04 -> 0x[4-7c-f]*; "
+            f"~ 60; \x05 -> 0; \x07 -> ±; FRF? 1 -> 1=1; POS? 1 -> 1={at}.000000; at 60 -> {at}",
+        )
+        for command, at in (("FRF", 0), ("FNL", -20), ("FPL", 30))
+    },
+}  # fmt: skip
 
 
-def test_leaving_backwards_ends_it_and_coming_again_begins_anew(wire: Wire) -> None:
-    wire.window("1", "2", "5.5")
-    wire.run("MOV 1 3.5")
-    wire.run("MOV 1 0")
-    wire.run("MOV 1 4.5")
-    assert wire.degrees() == [2, 3, 2, 2, 3, 4]
-
-
-def test_switched_on_inside_the_window_it_counts_from_where_it_stands(wire: Wire) -> None:
-    wire.run("MOV 1 2.2")
-    wire.window("1", "2", "5.5")
-    wire.run("MOV 1 9")
-    assert wire.degrees() == [3.2, 4.2, 5.2]
-
-
-def test_switched_off_or_in_another_mode_or_on_another_output_there_is_nothing(wire: Wire) -> None:
-    wire.window("1", "2", "5.5")
-    wire.tell("TRO 1 0")
-    wire.run("MOV 1 9")
-    wire.run("MOV 1 0")
-    wire.window("1", "2", "5.5")
-    wire.tell("CTO 1 3 2")
-    wire.run("MOV 1 9")
-    wire.run("MOV 1 0", "TRO 1 0", "CTO 2 1 1", "CTO 2 8 2", "CTO 2 9 5.5", "TRO 2 1")
-    wire.run("MOV 1 9")
-    assert wire.degrees() == []
-    assert wire.ask("TRO?") == "1=0 \n2=1 \n3=0 \n4=0"
-
-
-def test_pulses_that_run_into_each_other_merge() -> None:
-    """At 10 degrees/s a step of 0.01 degrees takes 1 ms, as long as a pulse is held."""
-    wire = Wire(pulse_width=1.001e-3)
-    wire.window("0.01", "5", "6.005")
-    wire.run("MOV 1 20")
-    assert len(wire.pulses()) == 1
-    wire = Wire(pulse_width=0.999e-3)
-    wire.window("0.01", "5", "6.005")
-    wire.run("MOV 1 20")
-    assert len(wire.pulses()) == 101
+@played(DIALOGUES)
+def test_it_answers_and_moves_as_documented(build: dict[str, Any], said: str) -> None:
+    play(Wire(**build), said)
 
 
 def test_where_low_is_active_the_line_rises_when_a_pulse_ends() -> None:
@@ -145,22 +159,7 @@ def test_where_low_is_active_the_line_rises_when_a_pulse_ends() -> None:
     wire.window("1", "5", "7.5")
     wire.run("MOV 1 20")
     assert [pulse.time for pulse in wire.pulses()] == pytest.approx([crossing(at) + 1e-3 for at in (5, 6, 7)])
-    assert wire.degrees() == [5.01, 6.01, 7.01]
-
-
-def test_lost_pulses_are_missing_and_no_others() -> None:
-    wire = Wire(lost={0, 3})
-    wire.window("1", "2", "7.5")
-    wire.run("MOV 1 20")
-    assert wire.degrees() == [3, 4, 6, 7]
-
-
-def test_a_motion_error_ends_the_pulses() -> None:
-    wire = Wire(stall_at=4500)
-    wire.window("1", "2", "7.5")
-    wire.tell("MOV 1 20")
-    wire.clock.sleep(60.0)
-    assert wire.degrees() == [2, 3, 4]
+    assert wire.places() == [5.01, 6.01, 7.01]
 
 
 @settings(max_examples=60)
@@ -179,31 +178,10 @@ def test_without_a_window_pulses_are_a_step_apart_and_as_many_as_the_way_has(way
                 last = at
                 expected.append(at / 1000)
         here = target
-    assert wire.degrees() == expected
+    assert wire.places() == expected
 
 
 # bytes and lines
-
-
-def test_replies_have_the_documented_form(wire: Wire) -> None:
-    wire.clock.sleep(0.1)
-    assert "Physik Instrumente" in wire.ask("*IDN?")
-    assert "C-863.12" in wire.ask("*IDN?")
-    assert wire.ask("CSV?") == "2.0"
-    assert wire.ask("SAI?") == wire.ask("SAI? ALL") == "1"
-    assert wire.ask("POS? 1") == wire.ask("POS?") == "1=0.000000"
-    assert wire.ask("SVO? 1") == "1=1"
-    assert wire.ask("FRF? 1") == "1=1"
-    assert wire.ask("VEL? 1") == "1=10.000000"
-    assert wire.ask("SPA? 1 0xE") == "1 0xE=360000.000000"
-    assert wire.ask("SPA? 1 15") == "1 0xF=360.000000"
-    assert wire.ask("CTO? 1 3") == "1 3=0"
-    assert wire.ask("TRO? 1") == "1=0"
-    assert wire.raw(b"\x04") == b"0x9002\n"
-
-
-def test_replies_of_several_lines_end_with_space_and_line_feed_but_for_the_last(wire: Wire) -> None:
-    assert wire.raw(b"TRO?\n") == b"1=0 \n2=0 \n3=0 \n4=0\n"
 
 
 def test_control_bytes_act_at_once_even_within_a_line(wire: Wire) -> None:
@@ -253,57 +231,3 @@ def test_a_wrong_command_only_sets_the_error_register_once(wire: Wire, command: 
     assert wire.ask("ERR?") == "0"
     assert wire.raw(b"\x05") == b"0\n"
     assert wire.ask("POS? 1") == "1=0.000000"
-
-
-def test_the_last_error_wins(wire: Wire) -> None:
-    assert wire.complains("MOV 1 9999", "XYZ") == 2
-
-
-# moves
-
-
-def test_acceleration_and_deceleration_are_two_things(wire: Wire) -> None:
-    """Up 0.5 s and 2.5 degrees, down 2 s and 10 degrees, between them 17.5 degrees: 4.25 s in all."""
-    wire.tell("DEC 1 5", "MOV 1 30")
-    wire.clock.sleep(4.249)
-    assert wire.raw(b"\x05") == b"1\n"
-    wire.clock.sleep(0.002)
-    assert wire.raw(b"\x05") == b"0\n"
-    assert math.degrees(wire.line.angle_at(2.25)) == pytest.approx(20.0)
-    assert math.degrees(wire.line.angle_at(3.25)) == pytest.approx(27.5)
-
-
-def test_a_relative_move_goes_from_the_last_target(wire: Wire) -> None:
-    wire.run("MOV 1 3")
-    wire.run("MVR 1 -4.5")
-    assert wire.ask("POS? 1") == "1=-1.500000"
-
-
-def test_the_position_read_is_one_servo_cycle_old() -> None:
-    wire = Wire(servo_period=0.01)
-    wire.tell("MOV 1 100")
-    wire.clock.sleep(2.0)
-    assert wire.ask("POS? 1") == "1=17.400000"
-
-
-# reference and faults
-
-
-@pytest.mark.parametrize(("command", "at"), [("FRF 1", 0.0), ("FNL 1", -20.0), ("FPL 1", 30.0)])
-def test_a_reference_move_finds_the_true_zero(command: str, at: float) -> None:
-    wire = Wire(referenced=False, found_at=-4.0, low=-20, high=30)
-    assert wire.ask("POS? 1") == "1=0.000000"
-    assert math.degrees(wire.line.angle_at(0.0)) == pytest.approx(-4.0)
-    wire.tell(command)
-    assert (wire.raw(b"\x05"), wire.raw(b"\x07"), wire.ask("FRF? 1")) == (b"1\n", b"\xb0\n", "1=0")
-    assert int(wire.raw(b"\x04"), 16) & 1 << 14
-    wire.clock.sleep(60.0)
-    assert (wire.raw(b"\x05"), wire.raw(b"\x07"), wire.ask("FRF? 1")) == (b"0\n", b"\xb1\n", "1=1")
-    assert wire.ask("POS? 1") == f"1={at:.6f}"
-    assert math.degrees(wire.line.angle_at(wire.clock.now())) == pytest.approx(at)
-
-
-def test_a_stage_without_switches_says_so() -> None:
-    wire = Wire(reference_switch=False, limit_switches=False)
-    assert (wire.ask("TRS? 1"), wire.ask("LIM? 1")) == ("1=0", "1=0")
-    assert [wire.complains(command) for command in ("FRF 1", "FNL 1", "FPL 1")] == [31, 32, 32]

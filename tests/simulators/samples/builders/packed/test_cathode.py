@@ -10,7 +10,6 @@ import pytest
 from scipy.stats import kstest, truncnorm
 
 from recon.base.volume import Grid
-from simulators.frame.mapping import SceneError
 from simulators.light import Beam
 from simulators.samples.bodies.solids import Ellipsoid, Polyhedron
 from simulators.samples.builders.packed.cathode import (
@@ -26,6 +25,7 @@ from simulators.samples.builders.packed.cathode import (
 )
 from simulators.samples.composed import build_sample
 from simulators.samples.materials.materials import known
+from tests.refused_calls import refused_calls
 from tests.simulators.bodies import volume
 from tests.simulators.samples.builders.packed.test_arrangement import corners, overlapping, spread
 
@@ -124,24 +124,4 @@ def test_in_a_beam_with_energies_parts_are_materials() -> None:
         assert np.median(truth[inside]) == pytest.approx(float(material.attenuation(25.0)), rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"size_um": 0}, "size_um is 0; expected a number >= 1e-06"),
-        ({"size_um": 100, "fill": 0.5, "diameter": 0.11}, "does not fit"),
-        ({"size_um": 300}, "larger than the whole fill"),
-        ({"hollow": 0.7, "cracked": 0.7}, "1 at most in sum"),
-        ({"habits": {"cube": 1}}, r"habits\.cube: key must be 'sphere'"),
-        ({"habits": {"sphere": 0}}, "not all 0"),
-        ({"wall_um": 100}, "no room for the cathode inside"),
-        ({"separator_um": 150}, "no room for the cathode inside"),
-        ({"diameter": 1e5}, "are more than 100000 grains"),
-        ({"gap_um": 100.0}, "a gap of 100 um between .* is more than .* have room for"),
-        ({"made_of": {"lid": "Al"}}, "part of this phantom 'lid' is unknown"),
-        ({"attenuation": {"lid": 1.0}}, "part of this phantom 'lid' is unknown"),
-        ({"made_of": {"wall": "steel"}}, "need a beam with energies"),
-    ],
-)
-def test_wrong_settings_are_refused(changed: dict[str, Any], message: str) -> None:
-    with pytest.raises(SceneError, match=message):
-        build_sample("phantom", {"kind": "cathode", **SMALL, "habits": {"sphere": 1}} | changed, Beam(1e5))
+test_calls_that_are_refused = refused_calls(__file__, globals())

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 
 from recon.base.volume import Grid
-from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
 from simulators.light import Beam
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from simulators.samples.builders.packed.foam import Foam
 from simulators.samples.builders.packed.pieces import Charge, Settle
-from simulators.samples.composed import build_sample
 from simulators.samples.sample import sample_at
 from simulators.scenes.expose import expose
 from simulators.scenes.scene import load_scene
+from tests.refused_calls import refused_calls
 from tests.simulators.shots import shot
 
 FOAM = {"kind": "foam", "n_holes": 60, "candidates": 4000, "smallest_um": 30.0, "largest_um": 120.0, "gap_um": 3.0}
@@ -77,15 +76,4 @@ def test_a_frame_shows_the_sample_of_its_time(phantom: dict[str, Any]) -> None:
     assert masses[1] < 0.97 * masses[0]
 
 
-@pytest.mark.parametrize(
-    ("phantom", "said"),
-    [
-        (CELL | {"change": {"kind": "settle"}}, "does not settle"),
-        (FOAM | {"change": {"kind": "charge"}}, "no part of this phantom"),
-        (FOAM | {"change": {"kind": "melt"}}, "melt"),
-        (FOAM | {"change": {"kind": "settle", "share": 1.5}}, "share"),
-    ],
-)
-def test_changes_that_do_not_fit_are_refused(phantom: dict[str, Any], said: str) -> None:
-    with pytest.raises(SceneError, match=said):
-        build_sample("scene.phantom", phantom, GREY)
+test_calls_that_are_refused = refused_calls(__file__, globals())

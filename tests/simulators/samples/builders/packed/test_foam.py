@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from recon.base.volume import Grid
-from simulators.frame.mapping import SceneError
 from simulators.frame.shot import Detector
 from simulators.light import Beam
 from simulators.samples.bodies.solids import Ellipsoid
 from simulators.samples.builders.packed.foam import Foam, holes
 from simulators.samples.composed import build_sample
+from tests.refused_calls import refused_calls
 
 SETTINGS: dict[str, Any] = {"n_holes": 400, "candidates": 20_000, "gap_um": 2.0}
 
@@ -97,14 +97,4 @@ def test_in_a_beam_with_energies_holes_are_air() -> None:
     assert 0 < truth[labels == 2].min() < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"diameter": 0}, "diameter is 0; expected a number >"),
-        ({"smallest_um": 100}, "from largest_um down"),
-        ({"attenuation": {"foam": 1.0}}, "part of this phantom 'foam' is unknown"),
-    ],
-)
-def test_wrong_settings_are_refused(changed: dict[str, Any], message: str) -> None:
-    with pytest.raises(SceneError, match=message):
-        build_sample("phantom", {"kind": "foam", **changed}, Beam(1e5))
+test_calls_that_are_refused = refused_calls(__file__, globals())
