@@ -142,7 +142,7 @@ class PlaceStep(PrepStep, Protocol):
 
     def place(
         self,
-        scan: ScanEvidence,
+        source: ScanSource,
         selection: ScanSelection,
         usable: UsableViews,
         axis_col: float,

@@ -15,7 +15,7 @@ from beamline.monitor.watch import look_past_failures, start
 from beamline.projections.replayed_frames import context_of, frames_of
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.base import ScanSource
-from beamline.storage.rules.evidence import Asked, ScanEvidence
+from beamline.storage.rules.evidence import EvidenceRequest, ScanEvidence
 from beamline.storage.rules.scan import altered_sentence
 from drivers.base.clock import Clock
 from drivers.base.frame import FrameKind
@@ -167,7 +167,7 @@ def verdict(source: ScanSource, judged: Sequence[FrameVerdict], limits: Referenc
     """
     flags = [flag for each in judged for flag in each.flags]
     again = frozenset(source.table.replaced.tolist())
-    found = ScanEvidence(source, Asked(limits=limits)).findings
+    found = ScanEvidence(source, EvidenceRequest(limits=limits)).findings
     failures = tuple(failure for each in judged for failure in each.failures)
     return ScanVerdict(
         n_frames=len(judged),

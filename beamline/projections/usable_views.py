@@ -85,6 +85,7 @@ class UsableViews:
     """The views of a scan that a reconstruction may use.
 
     Attributes:
+        scan: the evidence that they were chosen by.
         frames: int64 [view], their rows in the file.
         weights: float32 [frame of the file], of each row that is a view; None: one for all.
         left_out: views with an alarm, which are not among them.
@@ -94,6 +95,7 @@ class UsableViews:
         jumps: int64, rows from which on the monitor saw the sample elsewhere; ascending.
     """
 
+    scan: ScanEvidence
     frames: NDArray[np.int64]
     weights: NDArray[np.float32] | None = None
     left_out: int = 0
@@ -130,21 +132,21 @@ def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
     views, flags = scan.table.are_views, scan.flags
     rows = np.flatnonzero(views)
     if flags is None or not (flags.flagged if use_flags else flags.flagged[rows]).any():
-        return UsableViews(rows, flags=flags)
+        return UsableViews(scan, rows, flags=flags)
     if not use_flags:
         alarmed, warned = views & flags.alarmed, views & flags.flagged & ~flags.alarmed
         n = f"{count(int(alarmed.sum()), 'view')} with an alarm and {warned.sum()} with a warning"
         sentence = f"--flags ignore: {n} are used as they are."
-        return UsableViews(rows, sentence=sentence, flags=flags)
+        return UsableViews(scan, rows, sentence=sentence, flags=flags)
     treated = treatment_of(flags, views, scan.source.shape)
     if not treated.in_words:
-        return UsableViews(rows, flags=flags, jumps=treated.jumps)
+        return UsableViews(scan, rows, flags=flags, jumps=treated.jumps)
     weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
     good = np.flatnonzero(views & ~treated.left_out)
     gap = gap_sentence(scan, rows, good)
     sentence = f"{treated.in_words}{gap and f' They{gap}.'} --flags ignore weighs all equally."
     regions = regions_of(treated)
-    return UsableViews(good, weights, int(treated.left_out.sum()), sentence, flags, regions, treated.jumps)
+    return UsableViews(scan, good, weights, int(treated.left_out.sum()), sentence, flags, regions, treated.jumps)
 
 
 def gap_sentence(scan: ScanEvidence | ScanSource, before: NDArray[np.int64], after: NDArray[np.int64]) -> str:

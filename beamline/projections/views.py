@@ -23,7 +23,7 @@ from beamline.projections.usable_views import UsableViews, usable_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.transforms import WRAPPED
 from beamline.storage.rules import Finding, angles_shown
-from beamline.storage.rules.evidence import Asked, ScanEvidence
+from beamline.storage.rules.evidence import EvidenceRequest, ScanEvidence
 from beamline.storage.rules.scan import VARYING, findings_of
 from beamline.storage.rules.stored_order import SINOGRAM
 from beamline.storage.rules.treatment import FLAGS
@@ -84,7 +84,7 @@ class ViewGeometry:
     def find_motion(self, usable: UsableViews, warn: Warn, phases: Phases) -> UsableViews:
         """Let each step find the sample position; returns the `usable` views that remain usable."""
         for step in (step for step in in_order(self.selection) if isinstance(step, PlaceStep)):
-            motion = step.place(self.scan, self.selection, usable, self.stated_axis, phases.progress)
+            motion = step.place(self.scan.source, self.selection, usable, self.stated_axis, phases.progress)
             self.moved[step.name] = motion
             if motion.done.sentence:
                 warn(motion.done.sentence)
@@ -121,11 +121,11 @@ class ViewGeometry:
 _OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules on what vectors of each view take the place of
 
 
-def asked_of(source: ScanSource, selection: Selection) -> Asked:
+def asked_of(source: ScanSource, selection: Selection) -> EvidenceRequest:
     """What a selection asks of the evidence of a scan; the monitor looks at its frames where that is asked for."""
     asked = selection.step(Preparation)
     judged = judged_flags(source) if asked.judged and source.finished else None
-    return Asked(asked.accepted, selection.cone, judged)
+    return EvidenceRequest(asked.accepted, selection.cone, judged)
 
 
 def evidence_of(source: ScanSource, selection: Selection) -> ScanEvidence:

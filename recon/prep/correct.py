@@ -124,6 +124,8 @@ class CorrectionPlan:
         flats: (position, float32 [row, col]) of each group of flats, in order, without its dark; 1 in masked pixels.
         part_starts, dynamic: as of `References`.
         masked: bool [row, col], pixels that are filled in every view.
+        hidden: bool [row, col], `masks.areas` of them.
+        filling: in which order they are filled, see `masks.plan_fill`.
         photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`; None:
             the line integrals are logarithms.
         foreign: bool [row], rows in which what is dark is not the sample, see `unmeasured`; None: none.
@@ -138,19 +140,13 @@ class CorrectionPlan:
     part_starts: tuple[int, ...]
     dynamic: DynamicFlats | None
     masked: Mask
+    hidden: Mask
+    filling: Fill
     spots: SpotFilter
     photons: Photons | None = None
     foreign: Mask | None = None
     light: F64 | None = None
     profiles: tuple[tuple[F32, I64], ...] = ()
-
-    @cached_property
-    def _hidden(self) -> Mask:
-        return areas(self.masked)
-
-    @cached_property
-    def _filling(self) -> Fill:
-        return plan_fill(self.masked)
 
     @cached_property
     def air_columns(self) -> tuple[int, int]:
@@ -197,18 +193,18 @@ class CorrectionPlan:
                 view /= flat
             if beam is not None and self.photons is not None:
                 np.divide(flat, np.float32(self.photons.gain), out=beam[v])
-                fill(beam[v], self._filling)
+                fill(beam[v], self.filling)
             bad = ~np.isfinite(view) & ~self.masked
             repaired[v] = bad.sum()
             if repaired[v] > view.size / 2:
                 raise ValueError(
                     f"view {view_ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
                 )
-            if (unseen := unmeasured(counts[v], view, self._hidden, self.foreign)) is not None:
+            if (unseen := unmeasured(counts[v], view, self.hidden, self.foreign)) is not None:
                 runs.append(runs_of(unseen, int(view_ids[v])))
                 repaired[v] -= np.count_nonzero(bad & unseen)
                 bad |= unseen
-            fill(view, plan_fill(bad | self.masked) if repaired[v] or unseen is not None else self._filling)
+            fill(view, plan_fill(bad | self.masked) if repaired[v] or unseen is not None else self.filling)
             progress(v + 1)
         if self.light is not None:
             light = self.light[view_ids].astype(np.float32)[:, None, None]
@@ -325,7 +321,10 @@ def survey(
             for position, flat in sorted(references.flats, key=lambda group: group[0])
         )
     spots = SpotFilter(settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
-    return CorrectionPlan(settings, dark, flats, references.part_starts, references.dynamic, masked, spots, **known)
+    starts, hidden, filling = references.part_starts, areas(masked), plan_fill(masked)
+    return CorrectionPlan(
+        settings, dark, flats, starts, references.dynamic, masked, hidden, filling, spots, **known
+    )  # fmt: skip
 
 
 def _check_views(counts: NDArray[np.generic], positions: NDArray[np.float64], shape: tuple[int, ...]) -> None:

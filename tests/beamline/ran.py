@@ -3,7 +3,7 @@
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.run_record import RecordFile, RunRecord
 from beamline.storage.writer_lock import QUIET
 from beamline.storage.writers.nxtomo import NXtomoWriter
-from tests.beamline.fakes import FakeInstrument, assert_true
+from tests.beamline.fakes import FakeInstrument, Faults, assert_true
 
 SMALL = (
     "scan.angles.views=12",
@@ -127,3 +127,15 @@ def killed(patch: pytest.MonkeyPatch) -> Iterator[None]:
         path.with_name("died.h5").replace(path)
         when = path.stat().st_mtime - 2 * QUIET
         os.utime(path, (when, when))
+
+
+def ended_run(runs: Path, how: str, *overrides: str, at: int) -> Path:
+    """The folder of a run that was stopped, aborted or killed at a frame, or lost three views from there on: two of
+    them side by side, and the last of twelve."""
+    if how == "lossy":
+        faults = Faults(lost={at}, ignored={at + 1, 16})
+        return Ran(runs, FakeInstrument(faults), *overrides).folder
+    stop = StopRequest()
+    instrument = FakeInstrument(at={at: stop.stop if how == "stopped" else stop.abort})
+    with pytest.MonkeyPatch.context() as patch, killed(patch) if how == "killed" else nullcontext():
+        return Ran(runs, instrument, *overrides, stop=stop).folder

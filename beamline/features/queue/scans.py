@@ -22,7 +22,7 @@ from beamline.core.errors import AlarmError, BeamlineError, ConfigError, ScanSto
 from beamline.core.events import Done, Event, RunStarted, Sink, StateEntered
 from beamline.core.files import SETTINGS, text_in
 from beamline.core.stop import StopRequest
-from beamline.core.text import count, size
+from beamline.core.text import aligned, count, size
 from beamline.instrument.connect import ask_operator
 from beamline.plan.limits import ROOM
 from beamline.plan.timeline import duration_text
@@ -160,13 +160,17 @@ class QueueNeeds:
 
     def lines(self) -> list[str]:
         """A line for each scan, and the sum."""
-        lines = [f"{'scan':<24}  {'frames':>8}  {'size':>8}  time"]
-        for name, worked in self.scans:
-            times = len(worked.energies) or 1
-            cells = f"{times * worked.timeline.n_frames:>8}  {size(worked.total_bytes):>8}"
-            lines.append(f"{name:<24}  {cells}  {duration_text(_seconds(worked))}")
+        rows = [
+            (name, str((len(worked.energies) or 1) * worked.timeline.n_frames), size(worked.total_bytes),
+             duration_text(_seconds(worked)))
+            for name, worked in self.scans
+        ]  # fmt: skip
         total = f"{size(self.total_bytes)} of {size(self.free_bytes)} free, {duration_text(self.duration)}"
-        return [*lines, "", f"{count(len(self.scans), 'scan')}: {total}, without what is done between them"]
+        return [
+            aligned([("scan", "frames", "size", "time"), *rows]),
+            "",
+            f"{count(len(self.scans), 'scan')}: {total}, without what is done between them",
+        ]
 
     def data(self) -> Mapping[str, Any]:
         """The needs for programs: s and bytes of each scan and of all."""
@@ -242,11 +246,7 @@ def run_queue(
 
 def summary(outcomes: Sequence[ScanOutcome]) -> list[str]:
     """A line for each scan."""
-    width = max((len(outcome.name) for outcome in outcomes), default=0)
-    return [
-        f"{outcome.name:<{width}}  {outcome.status:<11}  {outcome.path or ''}  {outcome.why}".rstrip()
-        for outcome in outcomes
-    ]
+    return aligned([(each.name, each.status, str(each.path or ""), each.why) for each in outcomes]).split("\n")
 
 
 def raise_unless_complete(outcomes: Sequence[ScanOutcome]) -> None:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from beamline.projections.usable_views import UsableViews
     from beamline.storage.pose_table import PoseTable
     from beamline.storage.readers.base import ScanSource
-    from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.arrays import F64, I64
     from recon.base.geometry import Geometry
 
@@ -67,13 +66,13 @@ class PosesOfFile:
 
     def place(
         self,
-        scan: ScanEvidence,
+        source: ScanSource,
         selection: ScanSelection,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        return poses_of(scan.source, selection, usable.frames) or Unmoved(usable.frames)
+        return poses_of(source, selection, usable.frames) or Unmoved(usable.frames)
 
 
 def stated_poses(source: ScanSource, selection: Selection) -> PoseTable | None:

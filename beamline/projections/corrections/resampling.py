@@ -221,8 +221,9 @@ def _refined(
     rows = scan.source.shape[0] / selection.binning
     tilt = 0.0
     for n in range(_ROUNDS):
-        turned = plain.with_steps(replace(step, tilt=math.degrees(tilt)))
-        levelled = ScanCorrection(scan, turned, lambda _: None, frames)
+        levelled = ScanCorrection(
+            scan, plain.with_steps(replace(step, tilt=math.degrees(tilt))), lambda _: None, frames
+        )  # fmt: skip
         residual = shown_tilt(
             scan.source, levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress)
         )

@@ -41,7 +41,7 @@ class ReferenceGroups(NamedTuple):
     flats: tuple[I64, ...]
 
 
-class Asked(NamedTuple):
+class EvidenceRequest(NamedTuple):
     """What is asked of the evidence of a scan.
 
     Attributes:
@@ -70,7 +70,7 @@ class ScanEvidence:
     """
 
     source: ScanSource
-    asked: Asked = field(default_factory=Asked)
+    asked: EvidenceRequest = field(default_factory=EvidenceRequest)
     table: FrameTable = field(init=False)
     _seen: dict[int, FrameStatistics] = field(default_factory=dict)
     _lit: dict[int, bool] = field(init=False, default_factory=dict)

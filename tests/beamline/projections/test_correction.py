@@ -48,6 +48,26 @@ def test_batches_are_the_views_at_once_also_where_the_end_comes_later(sizes: lis
     np.testing.assert_array_equal(parts.view_ids, whole.view_ids)
 
 
+def test_at_once_in_batches_and_as_they_come_are_loops_over_one_plan(rng: np.random.Generator) -> None:
+    """With bright spots, and a clamp in the beam of all views that is not in the flats."""
+    counts = SCAN.counts()
+    counts[:, :, :5] = DARK + rng.integers(-3, 4, (45, 4, 5))
+    counts[rng.random(counts.shape) < 4e-3] += np.uint16(BEAM // 8)
+    source, frames = counted(counts, SCAN.angles), np.arange(2, 47)
+    scan, said, out = evidence_of(source, PLAIN), list[str](), np.empty((45, 4, 40), np.float32)
+    correction = ScanCorrection(scan, PLAIN.of(source), said.append, frames)
+    whole, plan = correction.at_once(frames), correction.plan
+    batches = correction.in_batches(frames, out, 7, lambda n, of: None)
+    fed = [correction.feed(part, last=part[-1] == 46) for part in np.array_split(frames, 6)]
+    parts = merge_and_empty([part for part in fed if part is not None])
+    assert plan is correction.plan and plan.shadow is not None
+    assert plan.shadow[0][:, :5].all() and not plan.shadow[0][:, 8:].any() and whole.replaced > 0
+    for found in (batches, parts):
+        np.testing.assert_array_equal(found.data, whole.data)
+        np.testing.assert_array_equal(found.masked, whole.masked)
+    assert not correction.finds_shadow(frames) and not correction.outdated
+
+
 PARTS = {  # image keys of two parts
     "flats at the start": ([2, 1, 1, *[0] * 9], [2, 1, 1, *[0] * 9]),
     "flats at both ends": ([2, 1, 1, *[0] * 9, 1, 1], [2, 1, 1, *[0] * 9, 1, 1]),

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from hypothesis import Phase, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from beamline.cli.main import main
 from beamline.core.errors import BeamlineError, DataError
@@ -20,7 +26,7 @@ from beamline.core.files import JOINED, parts_of
 from beamline.core.stop import StopRequest
 from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import validate
-from beamline.scan.resume import open_for_resume, recover_run
+from beamline.scan.resume import NoFrame, NothingMissing, NotJoined, open_for_resume, recover_run
 from beamline.scan.run import run_scan
 from beamline.storage import parts
 from beamline.storage.hdf5 import open_hdf5
@@ -31,20 +37,31 @@ from beamline.storage.writers import layout
 from beamline.storage.writers.rows import Rows
 from drivers.base.errors import DeviceError
 from drivers.base.frame import Frame, FrameKind
-from tests.beamline.fakes import FakeInstrument, Faults
+from tests.beamline.fakes import FakeInstrument, Faults, assert_true
 from tests.beamline.ran import killed, small
+from tests.slow_cases import others_slow
 
 FIRST = 5  # 3 darks and 2 flats
 VIEWS = 12
-START, DARKS, VIEW, END = 0, 2, FIRST + 2, FIRST + 4  # frames of a part, at which it ends
+START, DARKS, VIEW, END, LAST = 0, 2, FIRST + 2, FIRST + 4, FIRST + VIEWS  # frames of a part, at which it ends
+
+
+MODES = {
+    "fly": ("scan.mode=fly",),
+    "step": ("scan.mode=step",),
+    "interlaced": ("scan.mode=fly", "scan.angles={scheme: interlaced, views: 12, passes: 2}"),
+    "backwards": ("scan.mode=fly", "scan.angles={scheme: fixed, views: 12, start_deg: 90, span_deg: -180}"),
+}
+ENDS = "stopped", "aborted", "failed", "killed", "full", "lossy", "unjoined"
 
 
 class Chain:
-    """A run whose parts end one after the other; `end` takes the next part, which ends so at a frame."""
+    """A run whose parts end one after the other; `end` takes the next part, which ends so at a frame, if it has one of
+    that number."""
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.folder, self.patch = folder, monkeypatch
-        self.config = small("scan.flats.at=both")
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch, mode: str = "fly") -> None:
+        self.folder, self.patch = folder, patch
+        self.config = small("scan.flats.at=both", *MODES[mode])
 
     @property
     def run(self) -> Path:
@@ -64,29 +81,30 @@ class Chain:
             run_scan(series.config, series, sinks, stop, instrument=devices)
 
     def end(self, how: str, at: int) -> None:
-        getattr(self, f"_{how}")(at)
+        with suppress(BeamlineError, DeviceError):
+            getattr(self, f"_{how}")(at)
         for part in self.run.rglob("scan.h5"):  # all of this was a while ago
             when = part.stat().st_mtime - 2 * QUIET
             os.utime(part, (when, when))
 
     def _stopped(self, at: int, abort: bool = False) -> None:
         stop = StopRequest()
-        act = stop.abort if abort else stop.stop
-        instrument = FakeInstrument(at={at: act})
-        with pytest.raises(BeamlineError):
-            self.take(instrument, stop, at_start=at == START)
+        instrument = FakeInstrument(at={at: stop.abort if abort else stop.stop})
+        self.take(instrument, stop, at_start=at == START)
 
     def _aborted(self, at: int) -> None:
         self._stopped(at, abort=True)
 
     def _failed(self, at: int) -> None:
         """A device fails."""
-        with pytest.raises(DeviceError):
-            self.take(FakeInstrument(Faults(errors={at: 99})), StopRequest())
+        self.take(FakeInstrument(Faults(errors={at: 99})), StopRequest())
+
+    def _lossy(self, at: int) -> None:
+        """To its end, with views lost, two of them side by side, and the last."""
+        self.take(FakeInstrument(Faults(lost={at}, ignored={at + 1, FIRST + VIEWS - 1})), StopRequest())
 
     def _killed(self, at: int) -> None:
         """As kill -9 leaves it: the newest part marked as being written, the joined file as it was."""
-
         with killed(self.patch), self._joined_stays():
             self._aborted(at)
 
@@ -99,10 +117,9 @@ class Chain:
             usual(table, frame, *given)
 
         usual = Rows.write
-        with self.patch.context() as patch:
+        with self.patch.context() as patch, pytest.raises(DataError, match="No space left"):
             patch.setattr(Rows, "write", write)
-            with pytest.raises(DataError, match="No space left"):
-                self.take(FakeInstrument(), StopRequest())
+            self.take(FakeInstrument(), StopRequest())
         part = parts_of(self.run)[-1] / "scan.h5"
         shutil.copy(part, part.with_name("died.h5"))
         part.with_name("died.h5").replace(part)
@@ -136,73 +153,204 @@ class _Stays:
                 self.path.write_bytes(self.before)
 
 
-def _frames(run: Path) -> int:
-    """Committed frames of all parts."""
-    n = 0
-    for part in run.rglob("scan.h5"):
-        with open_hdf5(part) as file:
-            n += int(file[layout.COMMITTED][()])
-    return n
+def _rows(run: Path) -> list[tuple[int, int]]:
+    """Kind and trigger of the committed frames of all parts, by their files."""
+    found: list[tuple[int, int]] = []
+    for part in parts_of(run):
+        if parts.may_hold_frames(part / "scan.h5"):
+            with open_hdf5(part / "scan.h5") as file:
+                n = int(file[layout.COMMITTED][()])
+                found += zip(file[layout.KIND][:n].tolist(), file[layout.TRIGGER][:n].tolist(), strict=True)
+    return found
 
 
-def _assert_whole(joined: Path) -> None:
-    with open_scan(joined) as source:
+def _views(run: Path) -> list[int]:
+    return sorted(trigger for kind, trigger in _rows(run) if kind == FrameKind.PROJECTION)
+
+
+def _assert_whole(path: Path) -> None:
+    """Each view once, at its angle and with the pixels of its angle, and all other frames of the parts."""
+    with open_scan(path) as source:
         frames = list(source.frames())
-    triggers = [frame.trigger for frame in frames if frame.kind is FrameKind.PROJECTION]
-    assert sorted(triggers) == list(range(VIEWS))
-    assert [finding.message for finding in validate(joined, lambda done, of: None) if finding.severity == "error"] == []
-    assert len(frames) == _frames(joined.parent)
+    assert_true(frames)
+    assert sorted((int(frame.kind), frame.trigger) for frame in frames) == sorted(_rows(path.parent))
+    assert _views(path.parent) == list(range(VIEWS))
+    assert [finding.message for finding in validate(path, lambda done, of: None) if finding.severity == "error"] == []
+    with h5py.File(path) as file:  # as another program reads it
+        assert len(file["exchange/data"]) == VIEWS
 
 
-CHAINS: tuple[Sequence[tuple[str, int]], ...] = (
-    [("killed", VIEW), ("killed", VIEW), ("stopped", START)],
-    [("killed", DARKS), ("failed", VIEW), ("killed", DARKS)],
-    [("stopped", VIEW), ("unjoined_whole", START)],
-    [("aborted", FIRST + VIEWS), ("aborted", START), ("killed", 0)],  # references of the end alone
-)
-MORE_CHAINS: tuple[Sequence[tuple[str, int]], ...] = (
-    [("stopped", VIEW), ("full", VIEW), ("aborted", VIEW)],
-    [("stopped", VIEW), ("unjoined", VIEW), ("stopped", START)],
-    [("stopped", VIEW), ("aborted", DARKS), ("aborted", VIEW)],
-    [("stopped", VIEW), ("full", DARKS), ("stopped", START)],
-    [("stopped", VIEW), ("stopped", VIEW), ("unjoined_whole", START)],
-)
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def _named(chain: Sequence[tuple[str, int]]) -> str:
-    return "-".join(f"{how}{at}" for how, at in chain)
+class PartsOfARun(RuleBasedStateMachine):
+    """Whatever its parts end with, and whatever is done between them: the joined file has the frames of all or is
+    refused, files that were closed stay as they are, and what is still missing, and no more, is taken at last."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.patch, self.temporary = pytest.MonkeyPatch(), TemporaryDirectory()
+        self.closed: dict[Path, str] = {}
+
+    @initialize(mode=st.sampled_from([*MODES]), how=st.sampled_from(ENDS), at=st.sampled_from([DARKS, VIEW, LAST]))
+    def begin(self, mode: str, how: str, at: int) -> None:
+        self.chain = Chain(Path(self.temporary.name) / "runs", self.patch, mode)
+        self._end(how, at)
+
+    @rule(how=st.sampled_from(ENDS), at=st.sampled_from([START, DARKS, VIEW, END]))
+    def end_another_part(self, how: str, at: int) -> None:
+        self._end(how, at)
+
+    def _end(self, how: str, at: int) -> None:
+        self.chain.end(how, at)
+        if how in ("stopped", "aborted", "failed") and len(self._parts_with_frames()) > 1:
+            assert is_joined(self.joined)
+        for part in parts_of(self.run):
+            file = part / "scan.h5"
+            if parts.may_hold_frames(file) and self._was_closed(file):
+                self.closed.setdefault(file, _digest(file))
+
+    @rule()
+    def recover(self) -> None:
+        before = _rows(self.run)
+        with suppress(DataError):  # it has no frame
+            recover_run(self.run)
+            assert _rows(self.run) == before and not any(done.changed for done in recover_run(self.run)[0])
+
+    @rule()
+    def look(self) -> None:
+        """What a resumption would take is what the files lack."""
+        try:
+            with open_for_resume(self.run) as series:
+                assert sorted(series.views) == _views(self.run)
+        except (NothingMissing, NotJoined) as ended:
+            assert _views(self.run) == list(range(VIEWS)) and isinstance(ended, NotJoined) is not self._is_joined()
+        except NoFrame:
+            assert _rows(self.run) == []
+
+    @rule()
+    def lose_the_joined_file(self) -> None:
+        self.joined.unlink(missing_ok=True)
+
+    @rule(content=st.sampled_from([b"", b"\xff"]))
+    def lose_the_newest_events(self, content: bytes) -> None:
+        """The file of the part says what it has; one that has nothing may be empty."""
+        first, *_, newest = [*parts_of(self.run)[:1], *parts_of(self.run)]
+        if newest != first:
+            (newest / "events.jsonl").write_bytes(content)
+            if newest / "scan.h5" not in self._parts_with_frames():
+                (newest / "scan.h5").write_bytes(b"")
+
+    @rule()
+    def spoil_a_view(self) -> None:
+        """It is taken again."""
+        (file, *others) = self._parts_with_frames()
+        views = [trigger for kind, trigger in _rows(self.run) if kind == FrameKind.PROJECTION]
+        if others or file not in self.closed or not views:
+            return
+        with h5py.File(file, "r+", libver=layout.LIBVER) as opened:
+            row = int(np.flatnonzero(opened[layout.KIND][()] == FrameKind.PROJECTION)[0])
+            opened[layout.KIND][row] = opened[layout.IMAGE_KEY][row] = FrameKind.INVALID
+        self.closed[file] = _digest(file)
+
+    @invariant()
+    def the_joined_file_has_all_frames_or_is_refused(self) -> None:
+        if not hasattr(self, "chain"):
+            return
+        if len(self._parts_with_frames()) < 2:
+            assert not self.joined.exists()
+            return
+        try:
+            with open_scan(self.joined) as source:
+                assert len(source.table) == len(_rows(self.run))
+        except DataError as refused:
+            assert "recover" in str(refused) or not self.joined.exists()
+
+    def teardown(self) -> None:
+        try:
+            if hasattr(self, "chain"):
+                self._finish()
+        finally:
+            self.patch.undo()
+            self.temporary.cleanup()
+
+    def _finish(self) -> None:
+        if not _rows(self.run):
+            with pytest.raises(NoFrame):
+                self.chain.take(FakeInstrument(), StopRequest())
+            return
+        missing, known = VIEWS - len(_views(self.run)), len(_rows(self.run))
+        try:
+            self.chain.take(FakeInstrument(), StopRequest())
+            kinds = [kind for kind, _ in _rows(self.run)[known:]]
+            references = FIRST + 2 if missing else 2  # with the views all are taken, at last those of the end alone
+            assert (kinds.count(FrameKind.PROJECTION), len(kinds)) == (missing, missing + references)
+        except NotJoined:
+            assert missing == 0 and not self._is_joined()
+            said = CliRunner().invoke(main, ["scan", "--resume", str(self.run)])
+            assert said.exit_code == 0, said.output
+        except NothingMissing:
+            assert missing == 0 and self._is_joined()
+        assert [kind for kind, _ in _rows(self.run)[-2:]] == [FrameKind.FLAT] * 2  # those of the end
+        _assert_whole(self.joined if self.joined.exists() else self.run / "scan.h5")
+        for file, digest in self.closed.items():
+            assert _digest(file) == digest
+        with pytest.raises(NothingMissing), open_for_resume(self.run):
+            ...
+
+    @property
+    def run(self) -> Path:
+        return self.chain.run
+
+    @property
+    def joined(self) -> Path:
+        return self.run / JOINED
+
+    def _is_joined(self) -> bool:
+        """There is one closed file of all frames."""
+        files = self._parts_with_frames()
+        return all(map(self._was_closed, files)) and (len(files) == 1 or is_joined(self.joined))
+
+    def _parts_with_frames(self) -> list[Path]:
+        return [part / "scan.h5" for part in parts_of(self.run) if parts.may_hold_frames(part / "scan.h5")]
+
+    @staticmethod
+    def _was_closed(file: Path) -> bool:
+        try:
+            h5py.File(file).close()
+        except OSError:  # marked as open for writing
+            return False
+        return True
+
+
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize(("runs", "steps"), others_slow([(3, 4), (15, 7)]))
+def test_any_order(runs: int, steps: int) -> None:
+    drawn = settings(max_examples=runs, stateful_step_count=steps, deadline=None, phases=[Phase.generate])
+    run_state_machine_as_test(PartsOfARun, settings=drawn)
 
 
 @pytest.mark.parametrize(
-    "chain",
+    ("mode", "steps"),
     [
-        *(pytest.param(chain, id=_named(chain)) for chain in CHAINS),
-        *(pytest.param(chain, id=_named(chain), marks=pytest.mark.slow) for chain in MORE_CHAINS),
+        ("step", [("killed", VIEW), ("killed", VIEW), ("stopped", START)]),
+        ("fly", [("killed", DARKS), ("failed", VIEW), ("killed", DARKS)]),
+        ("interlaced", [("stopped", VIEW), ("unjoined_whole", START)]),
+        ("backwards", [("aborted", LAST), ("aborted", START), ("killed", 0)]),  # references of the end alone
+        ("fly", [("lossy", FIRST + 2), ("full", DARKS), ("aborted", VIEW)]),
     ],
 )
-def test_the_joined_file_has_all_frames_or_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chain: Sequence[tuple[str, int]]
-) -> None:
-    made = Chain(tmp_path / "runs", monkeypatch)
-    for how, at in chain:
-        made.end(how, at)
-        joined = made.run / JOINED
-        if len([part for part in parts_of(made.run) if parts.may_hold_frames(part / "scan.h5")]) < 2:
-            assert not joined.exists()
-            continue
-        if how in ("stopped", "aborted", "failed"):
-            assert is_joined(joined)
-        try:
-            with open_scan(joined) as source:
-                assert len(source.table) == _frames(made.run)
-        except DataError as refused:
-            assert "recover" in str(refused) or not joined.exists()
-    if chain[-1][0] != "unjoined_whole":
-        made.take(FakeInstrument(), StopRequest())
-    else:
-        said = CliRunner().invoke(main, ["scan", "--resume", str(made.run)])
-        assert said.exit_code == 0, said.output
-    _assert_whole(joined)
+def test_named_orders(mode: str, steps: list[tuple[str, int]]) -> None:
+    made = PartsOfARun()
+    try:
+        made.begin(mode=mode, how=steps[0][0], at=steps[0][1])
+        for how, at in steps[1:]:
+            made.the_joined_file_has_all_frames_or_is_refused()
+            made.end_another_part(how=how, at=at)
+            made.look()
+    finally:
+        made.teardown()
 
 
 @pytest.fixture(scope="module")
@@ -270,7 +418,7 @@ def test_a_joined_file_whose_parts_changed_is_refused_and_made_again(
         open_scan(recovered)
     recover_run(recovered.parent)
     with open_scan(recovered) as source:
-        assert len(source.table) == _frames(recovered.parent)
+        assert len(source.table) == len(_rows(recovered.parent))
 
 
 def test_a_run_is_copied_as_a_whole_and_its_copy_needs_no_part(recovered: Path, tmp_path: Path) -> None:

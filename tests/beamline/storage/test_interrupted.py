@@ -16,8 +16,8 @@ from beamline.scan.resume import recover_run
 from beamline.storage.interrupted import next_step, scan_file, volume_file
 from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
-from tests.beamline.ran import Ran
-from tests.beamline.scan.test_resume import ENDS, _go_on
+from tests.beamline.ran import Ran, ended_run
+from tests.beamline.scan.test_resume import go_on
 
 AT = 10  # frames: in the views
 
@@ -36,8 +36,7 @@ def _both(run: Path) -> str:
 @pytest.fixture(scope="module")
 def died(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run whose program was killed."""
-    with pytest.MonkeyPatch.context() as patch:
-        return ENDS["killed"](tmp_path_factory.mktemp("died"), patch, at=AT)
+    return ended_run(tmp_path_factory.mktemp("died"), "killed", at=AT)
 
 
 @pytest.fixture(scope="module")
@@ -86,23 +85,21 @@ def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_reco
 
 
 @pytest.mark.parametrize("end", ["stopped", "aborted"])
-def test_a_scan_that_ended_early_can_be_resumed_until_nothing_is_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str
-) -> None:
-    run = ENDS[end](tmp_path, monkeypatch, at=AT)
+def test_a_scan_that_ended_early_can_be_resumed_until_nothing_is_missing(tmp_path: Path, end: str) -> None:
+    run = ended_run(tmp_path, end, at=AT)
     said = f"It ended early: `beamline scan --resume {run}` takes what is missing."
     assert next_step(run / "scan.h5") == said
     assert said in beamline("validate", run).output
     assert said in beamline("recon", run, "-m", "fbp", "-o", tmp_path / "part.h5", "--no-report").output
-    _go_on(run)
+    go_on(run)
     assert next_step(run / "scan.h5") == next_step(run / "joined.h5") == ""
     assert scan_file(run) == run / "joined.h5"
     assert "--resume" not in beamline("validate", run / "scan.h5").output
 
 
-def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run = ENDS["killed"](tmp_path, monkeypatch, at=AT)
-    _go_on(run)
+def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path) -> None:
+    run = ended_run(tmp_path, "killed", at=AT)
+    go_on(run)
     (run / "joined.h5").unlink()
     with pytest.raises(DataError, match="has 2 parts"):
         scan_file(run)

@@ -64,16 +64,16 @@ class Jumps:
 
     def place(
         self,
-        scan: ScanEvidence,
+        source: ScanSource,
         selection: ScanSelection,
         usable: UsableViews,
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        if stated_poses(scan.source, selection) is not None:  # it states where the sample was
+        if stated_poses(source, selection) is not None:  # it states where the sample was
             return Unmoved(usable.frames)
         if self.corrects_jumps:
-            return find_jumps(scan, selection, usable.frames, usable.jumps, axis_col, progress)
+            return find_jumps(usable.scan, selection, usable.frames, usable.jumps, axis_col, progress)
         where = frames_text(usable.jumps)
         sentence = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
         return SampleJumps(usable.frames, sentence if usable.jumps.size else "")

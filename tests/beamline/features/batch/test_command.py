@@ -23,7 +23,8 @@ from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock
 from tests.beamline.cli.small_scan import SCAN, beamline, left
-from tests.beamline.scan.test_resume import ENDS, FIRST, VIEWS, _go_on
+from tests.beamline.ran import ended_run
+from tests.beamline.scan.test_resume import FIRST, VIEWS, go_on
 from tests.beamline.scans import write_exchange
 from tests.clock import wait_until
 
@@ -232,11 +233,10 @@ def test_names_that_mean_something_else_are_only_names(folder: Path) -> None:
 
 @pytest.mark.usefixtures("in_this_process")
 def test_a_resumed_run_is_one_row_of_all_its_parts(folder: Path, tmp_path: Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        run = ENDS["stopped"](tmp_path / "runs", patch, at=FIRST + 4)
+    run = ended_run(tmp_path / "runs", "stopped", at=FIRST + 4)
     Path("recipe.yaml").write_text("method: fbp\naxis: 5.5\n")
     before = batch._rows([run / "scan.h5"], [])
-    _go_on(run)
+    go_on(run)
     given = [run / name for name in ("scan.h5", "part-2/scan.h5", "joined.h5", ".")]
     result = beamline("batch", run.parent / "*/scan.h5", *given, "--config", "recipe.yaml", "-o", "out")
     assert result.exit_code == 0, result.output

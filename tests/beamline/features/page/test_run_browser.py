@@ -21,8 +21,7 @@ from tests.beamline.fakes import FakeInstrument
 from tests.beamline.features.page.served import Served, listed, served
 from tests.beamline.features.page.test_app import page_feed, tile
 from tests.beamline.features.run_folder import write_run
-from tests.beamline.ran import Ran
-from tests.beamline.scan.test_resume import ENDS
+from tests.beamline.ran import Ran, ended_run
 from tests.beamline.scans import TwoCylinders
 
 SCAN = TwoCylinders()
@@ -54,9 +53,9 @@ def test_the_table_is_that_of_the_terminal_newest_first(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("end", "recovered"), [("killed", False), ("killed", True), ("aborted", False)])
 def test_a_run_that_ended_early_has_the_state_the_frames_and_the_next_step_that_commands_tell(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, recovered: bool
+    tmp_path: Path, end: str, recovered: bool
 ) -> None:
-    run = ENDS[end](tmp_path, monkeypatch, at=9)
+    run = ended_run(tmp_path, end, at=9)
     if recovered:
         recover_run(run)
     told, advice = describe(run), next_step(run / "scan.h5")

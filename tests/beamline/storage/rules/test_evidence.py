@@ -6,7 +6,7 @@ import numpy as np
 
 from beamline.storage.frame_table import FrameTable
 from beamline.storage.rules.angles_shown import angles_shown
-from beamline.storage.rules.evidence import Asked, ScanEvidence
+from beamline.storage.rules.evidence import EvidenceRequest, ScanEvidence
 from beamline.storage.rules.light import darks_beside_views, exposures_agree, light_one, references_usable
 from tests.beamline.array_source import ArraySource, scan_of
 
@@ -58,7 +58,7 @@ def test_a_running_scan_adds_its_new_frames_to_what_was_seen() -> None:
 
 def test_faulty_references_are_left_out_or_accepted_as_they_are() -> None:
     source = scan(lit_dark=3000)
-    checked, accepted = ScanEvidence(source), ScanEvidence(source, Asked(accepted=True))
+    checked, accepted = ScanEvidence(source), ScanEvidence(source, EvidenceRequest(accepted=True))
     assert checked.used.darks[0].tolist() == [0, 1, 2] and accepted.used.darks[0].tolist() == [0, 1, 2, 3]
     (warned,), (taken,) = references_usable(checked), references_usable(accepted)
     assert warned.message.endswith("The other darks are used instead.")

@@ -12,7 +12,7 @@ from beamline.monitor.check import Flag, Level
 from beamline.projections.usable_views import usable_views
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
-from beamline.storage.rules.evidence import Asked, ScanEvidence
+from beamline.storage.rules.evidence import EvidenceRequest, ScanEvidence
 from beamline.storage.rules.treatment import frames_flagged
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
@@ -58,8 +58,8 @@ def test_what_a_reconstruction_does_is_said_in_its_own_words(
     flags = [[Flag("bands", Level.ALARM, row, 0.5, 0.1, "", region)] if 6 <= row < 10 else [] for row in range(22)]
     judged = FrameFlags.of_flags(flags)
     with open_scan(write_flagged(tmp_path / "s.h5", FRAMES, {})) as source:
-        (finding,) = frames_flagged(ScanEvidence(source, Asked(judged=judged)))
-        taken = usable_views(ScanEvidence(source, Asked(judged=judged)), True)
+        (finding,) = frames_flagged(ScanEvidence(source, EvidenceRequest(judged=judged)))
+        taken = usable_views(ScanEvidence(source, EvidenceRequest(judged=judged)), True)
     assert finding.message.endswith(f"A reconstruction (--flags use): {said}")
     assert taken.sentence.startswith(said)
     assert taken.frames.size == 18 - taken.left_out == (18 if region else 14)
