@@ -16,8 +16,8 @@ from types import MappingProxyType
 import numpy as np
 
 from drivers.base.protocols import CameraSettings, CameraTiming
-from drivers.keys import MEGABYTES, CheckedSettings, key
 from recon.base.registry import unknown
+from recon.base.setting import CheckedSettings, setting
 
 SENSOR_SHAPE = (2304, 4096)
 PITCH_MM = 4.6e-3
@@ -196,32 +196,32 @@ class DcamOptions(CheckedSettings):
         ValueError: a number outside its range.
     """
 
-    trigger_active: TriggerActive = key(
+    trigger_active: TriggerActive = setting(
         TriggerActive.EDGE,
         "edge: a pulse begins an exposure of exposure_s. level: the pulse's length is the exposure; set exposure_s to "
         "it. sync_readout: a pulse ends an exposure and begins the next; n pulses give n - 1 frames, which no fly scan "
         "takes.",
     )
-    trigger_mode: TriggerMode = key(
+    trigger_mode: TriggerMode = setting(
         TriggerMode.NORMAL, "start: the first pulse begins a free run, which no fly scan takes."
     )
-    trigger_polarity: TriggerPolarity = key(
+    trigger_polarity: TriggerPolarity = setting(
         TriggerPolarity.POSITIVE,
         "The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here.",
     )
-    trigger_times: int = key(1, "Every so many pulses make one frame; a fly scan takes 1.", ge=1, le=10_000)
-    trigger_delay: float = key(
+    trigger_times: int = setting(1, "Every so many pulses make one frame; a fly scan takes 1.", ge=1, le=10_000)
+    trigger_delay: float = setting(
         0.0, "From a pulse to the exposure; the angle in the file stays that of the pulse.", unit="s", ge=0, le=10
     )
-    global_exposure: GlobalExposure = key(
+    global_exposure: GlobalExposure = setting(
         GlobalExposure.DELAYED,
         "delayed: rolling shutter. global_reset: all rows begin at once, later rows expose longer unless light is cut.",
     )
-    hot_pixels: HotPixelMode | None = key(
+    hot_pixels: HotPixelMode | None = setting(
         None,
         "null: counts as measured; else the camera repairs defects with this sensitivity, which alters data.",
     )
-    exposure_tolerance: float = key(
+    exposure_tolerance: float = setting(
         0.01, "By which fraction (and one line time) the camera may change an exposure before it is refused.", ge=0
     )
-    ring: int = key(1000, "Most memory for the ring; a full frame has 18.9 MB.", unit=MEGABYTES, gt=0, le=1_000_000)
+    ring: int = setting(1000, "Most memory for the ring; a full frame has 18.9 MB.", unit="mb", gt=0, le=1_000_000)

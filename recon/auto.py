@@ -9,15 +9,15 @@ import numpy as np
 
 from recon.base.choices import AUTO, Quality
 from recon.base.decisions import Decisions
-from recon.base.declared_types import NonNegative, check_settings
 from recon.base.geometry import Geometry
-from recon.base.method import Method, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
+from recon.base.setting import NonNegative
 from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.methods import CANDIDATES, by_name
 from recon.voxels.choice import LEAST_GAIN, TrialChoice
 from recon.voxels.held_out import LEAST_VIEWS
-from recon.voxels.iterative import TrialWatch, Watch, scaled_problem, threads_for
+from recon.voxels.iterative import TrialWatch, VoxelMethod, Watch, scaled_problem, threads_for
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial, TrialSettings
 
@@ -25,7 +25,7 @@ _SMALLEST = 64  # pixels a side: smaller detectors are not binned
 
 
 @dataclass(frozen=True, eq=False)
-class Auto:
+class Auto(Method):
     """Tries methods on a part of the scan, and takes the simplest that predicts views held out as well as the best.
 
     The part is the sixteen rows where most matter is, of a cone those in its middle; where these hold little of it, all
@@ -39,16 +39,15 @@ class Auto:
 
     name: ClassVar[str] = AUTO
     label: ClassVar[str] = "Automatic choice"
-    traits: ClassVar[Traits] = Traits(
-        device=True, budget=True, presets=True, needs_matter=True,
-        halo=max(by_name(name).traits.halo for name in CANDIDATES),
-    )  # fmt: skip
+    takes: ClassVar[frozenset[str]] = frozenset({"device", "budget", "quality"})
+    halo: ClassVar[int] = max(by_name(name).halo for name in CANDIDATES)
+    needs_matter: ClassVar[bool] = True
 
     candidates: tuple[Method, ...] = field(default_factory=lambda: tuple(by_name(name)() for name in CANDIDATES))
     least_gain: NonNegative = LEAST_GAIN
 
     def __post_init__(self) -> None:
-        check_settings(self)
+        super().__post_init__()
         if not self.candidates:
             raise ValueError("candidates must contain at least one method, got none")
 
@@ -61,7 +60,7 @@ class Auto:
         decide = control.decide or Decisions(problem.seed)
         choice = TrialChoice.of(decide("method", lambda: self.choose(problem, control)))
         chosen = self.candidates[-1 if choice.at is None else choice.at]
-        device = problem.device if chosen.traits.device else "cpu"
+        device = chosen.device_of(problem)
         decide.prior = choice.prior
         result = chosen.run(replace(problem, device=device), replace(control, decide=decide))
         settings = {**result.settings, "chosen_method": chosen.name, "chosen_because": choice.reason}
@@ -93,6 +92,10 @@ class Auto:
             raise ValueError("; ".join(each.remark for each in choice.predictions))
         return choice
 
+    @property
+    def alternatives(self) -> tuple[Method, ...]:
+        return self.candidates
+
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """A preview has no costly candidates; the best needs no minimum gain, and ends no fit that is behind."""
         if quality == "preview":
@@ -110,12 +113,17 @@ def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates
     """The trial of a problem; None: nothing can be held out there."""
     # In a slab only slices are counted.
     told = replace(control, on_progress=control.on_progress if control.decide is None else None)
-    sweeps = max(getattr(each, "trial_sweeps", 0) or getattr(each, "iterations", 0) for each in candidates)
+    sweeps = max(_sweeps(each) for each in candidates)
     watch = Watch(on_trial=TrialWatch(told, problem.geometry.n_views, sweeps))
     given = problem.views.masked()
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
     scan, _ = scaled_problem(projector, given.data, given.weights, None, True, watch, decide)
     return Trial.of(scan, TrialSettings(problem.wide, all_rows, control.now))
+
+
+def _sweeps(method: Method) -> int:
+    """Sweeps of a trial, of a method that has no trials of its own those of its volume."""
+    return method.trial_sweeps or (method.iterations if isinstance(method, VoxelMethod) else 0)
 
 
 def _coarse(problem: ReconProblem) -> tuple[ReconProblem, str]:

@@ -13,12 +13,12 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 from recon.base.arrays import F32, some_values
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.method import Method, ReconProblem, RunControl, setting
+from recon.base.method import Method, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
-from recon.methods import with_settings, with_trait
-from recon.splatting.fit_method import FitMethod
+from recon.methods import names_where, with_settings
+from recon.splatting.fit_method import Fit
 from recon.voxels.direct import Fbp, direct
-from recon.voxels.iterative import IterativeMethod, Watch, solve
+from recon.voxels.iterative import VoxelMethod, Watch, solve
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector
 
@@ -63,7 +63,7 @@ def error_bars(
     One squared difference is a poor variance. It is averaged over 7³ voxels, in four classes of the gradient apart.
     Noise is one part of the error, and the blur and the smoothing of the method are the other, which no refit shows.
     So the result is √((a s)² + (b g)²), where s is the deviation by the refits and g the change of the volume from
-    voxel to voxel. The method's trait `error_bars` has a and b. They were chosen on simulated scans, so that about 68 %
+    voxel to voxel. `Method.error_bars` has a and b. They were chosen on simulated scans, so that about 68 %
     of the true voxels are within one deviation (docs/error_bars.md).
 
     Args:
@@ -78,8 +78,8 @@ def error_bars(
         ValueError: a method without calibrated error bars, fewer than eight views, or a fit without a finish.
     """
     geometry = problem.geometry
-    if method.traits.error_bars is None:
-        known = ", ".join(with_trait("error_bars"))
+    if method.error_bars is None:
+        known = ", ".join(names_where(lambda each: each.error_bars))
         raise ValueError(f"the error bars of {method.name} are not calibrated; those of these methods are: {known}")
     if geometry.n_views < LEAST_VIEWS:
         raise ValueError(
@@ -87,19 +87,20 @@ def error_bars(
             f"got {geometry.n_views}"
         )
     method = method_on_voxels(method, decided)
-    factors = method.traits.error_bars
+    factors = method.error_bars
     assert factors is not None
     made: Mapping[str, Sequence[Any]] = {}
-    if method.traits.direct:
+    classes = 1  # the noise of FBP knows no edges
+    if not isinstance(method, VoxelMethod):
         difference = _alternating(method, problem)
     else:
+        classes = _CLASSES
         refitted = _refitted(method, problem, volume, decided, control)
         if refitted is None:
             return None
         difference, made = refitted
     gradient = _gradient(volume.data)
     decide = Decisions(problem.seed, decided)
-    classes = 1 if method.traits.direct else _CLASSES  # the noise of FBP knows no edges
     limits = decide(_LIMITS, lambda: _limits(gradient, classes))
     np.square(difference, out=difference)
     variance = _averaged(difference, gradient, limits)
@@ -114,7 +115,7 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
     Raises:
         ValueError: a fit without a finish.
     """
-    if not isinstance(method, FitMethod):
+    if not isinstance(method, Fit):
         return method
     if "weight" not in decided:
         raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
@@ -126,7 +127,7 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
 def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
     """Peak memory of `error_bars` in bytes, without the projections, their weights and the volume."""
     rays, voxels = geometry.n_views * math.prod(geometry.detector_shape), math.prod(grid.shape)
-    made_by = (FistaTv(), PnpDct()) if isinstance(method, FitMethod) else (method,)
+    made_by = (FistaTv(), PnpDct()) if isinstance(method, Fit) else (method,)
     work = max(one.memory(geometry, grid, True) for one in made_by)
     return work + 4 * (2 * rays + 5 * voxels)
 
@@ -146,11 +147,14 @@ def _alternating(method: Method, problem: ReconProblem) -> F32:
 
 
 def _refitted(
-    method: Method, problem: ReconProblem, volume: Volume, decided: Mapping[str, Sequence[Any]], control: RunControl
+    method: VoxelMethod,
+    problem: ReconProblem,
+    volume: Volume,
+    decided: Mapping[str, Sequence[Any]],
+    control: RunControl,
 ) -> tuple[F32, Mapping[str, Sequence[Any]]] | None:
     """Half the difference of two refits, divided by the extra weight of a half, and their decisions; None: stopped."""
-    assert isinstance(method, IterativeMethod)
-    refit: IterativeMethod = with_settings(method, {"iterations": max(1, round(_SHARE * method.iterations))})
+    refit: VoxelMethod = with_settings(method, {"iterations": max(1, round(_SHARE * method.iterations))})
     sweeps, begin, done, stopped = refit.iterations, control.now(), 0, False
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
     given = problem.views.masked()
@@ -170,7 +174,7 @@ def _refitted(
         decide = Decisions(problem.seed, follow)
         refitted = solve(
             refit, projector, data, weight=trust.copy() if known is None else known * trust, start=volume,
-            nonnegative=not setting(method, "allow_negative", False), watch=Watch(told),
+            nonnegative=not method.allow_negative, watch=Watch(told),
             decide=decide,
         )  # fmt: skip
         if stopped:

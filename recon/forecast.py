@@ -11,17 +11,19 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, Method, Progress, ReconProblem, RunControl, candidates_of
+from recon.base.method import Clock, Method, Progress, ReconProblem, RunControl
+from recon.base.method_kinds import Direct, Series
 from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.splatting.finish import FINISH_SWEEPS
-from recon.splatting.fit_method import FitMethod
+from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import count_for, joined_for
 from recon.splatting.settings import growth
 from recon.splatting.trial_fit import FIRST_SHARE
 from recon.voxels.choice import TRIALS
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, choice_sweeps
+from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.priors import STEPS
 
@@ -81,7 +83,7 @@ def forecast(method: Method, geometry: Geometry, grid: Grid, now: Clock) -> Fore
     Raises:
         ValueError: the method does not take the views.
     """
-    return None if method.traits.in_time else Timing(geometry, grid, now).of(method)
+    return None if isinstance(method, Series) else Timing(geometry, grid, now).of(method)
 
 
 class Timing:
@@ -102,14 +104,13 @@ class Timing:
         return self._known[key]
 
     def _of(self, method: Method) -> Forecast:
-        candidates = candidates_of(method)
-        if len(candidates) > 1:
-            return self._of_choice(candidates)
-        if (limit := getattr(method, "seconds", None)) is not None:
+        if len(method.alternatives) > 1:
+            return self._of_choice(method.alternatives)
+        if (limit := method.time_limit) is not None:
             return Forecast(0.0, {method.name: limit})
-        if method.traits.direct:
+        if isinstance(method, Direct):
             return Forecast(0.0, {method.name: self.direct_seconds(method)})
-        if isinstance(method, FitMethod):
+        if isinstance(method, Fit):
             return self._of_fit(method)
         return Forecast(self.trial_seconds(method), {method.name: self.pace(method).total})
 
@@ -125,12 +126,13 @@ class Timing:
         """Forecast of an iterative method in all voxels, at the speed of a part of them, or of the rows of a trial."""
         key = f"{of_trial} {method!r}"
         if key not in self._paces:
-            part, first = self._trial if of_trial else self._part, getattr(method, "first_sweeps", 0)
+            part, on_voxels = self._trial if of_trial else self._part, isinstance(method, VoxelMethod)
+            first = method.first_sweeps if isinstance(method, VoxelMethod) else 0
             pace = _timed(method, part, self._now, first + _PATCH_STEPS if first else _ITERATIONS, first)
             scale = _work(self._geometry, self._grid) / _work(part.geometry, part.grid)
             # Steps that are not over all views take as long whatever their number, by samples along rays.
             along = max(self._grid.shape) / max(part.grid.shape)
-            self._paces[key] = pace.scaled(scale, scale if hasattr(method, "iterations") else along)
+            self._paces[key] = pace.scaled(scale, scale if on_voxels else along)
         return self._paces[key]
 
     @property
@@ -139,7 +141,7 @@ class Timing:
 
     def trial_seconds(self, method: Method) -> float:
         """Seconds of the trials that choose its prior."""
-        sweeps: int = getattr(method, "trial_sweeps", 0)
+        sweeps = method.trial_sweeps
         if not (self._trial_share and sweeps):
             return 0.0
         smooth = self.pace(FistaTv(), of_trial=True).each
@@ -148,7 +150,7 @@ class Timing:
             return self._trial_share * ((CHOICE_SWEEPS + TRIAL_SWEEPS) * smooth + patches)
         return self._trial_share * sweeps * smooth
 
-    def fit_pace(self, method: FitMethod) -> Pace:
+    def fit_pace(self, method: Fit) -> Pace:
         """Forecast of a fit without its finish."""
         field = Grid.for_fit(self._geometry, self._grid)
         given = method.gaussians.n if isinstance(method.gaussians, Gaussians) else method.gaussians
@@ -164,7 +166,7 @@ class Timing:
         covers = _covered(math.prod(self._grid.shape), count) / _covered(math.prod(part.grid.shape), some)
         return _timed(short, part, self._now, _FIT_STEPS).scaled(self._scale, grown * covers)
 
-    def _of_fit(self, method: FitMethod) -> Forecast:
+    def _of_fit(self, method: Fit) -> Forecast:
         pace = self.fit_pace(method)
         if method.finish_sweeps == 0:
             return Forecast(0.0, {method.name: pace.total})
@@ -174,7 +176,7 @@ class Timing:
             finish += PnpDct.iterations * self.pace(PnpDct()).each
         return Forecast(choice, {method.name: pace.total + finish})
 
-    def _rendered(self, method: FitMethod) -> float:
+    def _rendered(self, method: Fit) -> float:
         """Seconds to render all views of a fit, for its finish."""
         return 2 * _RENDER * self._geometry.n_views * self.fit_pace(method).each / method.fit.views_per_step
 
@@ -189,11 +191,11 @@ class Timing:
 
     def _tried(self, method: Method) -> float:
         """Seconds of a method's own volume in a trial of all rows, beside the search for priors."""
-        if isinstance(method, FitMethod) and method.finish is None:
+        if isinstance(method, Fit) and method.finish is None:
             pace = self.fit_pace(method)
             first = pace._replace(planned=round(FIRST_SHARE * pace.planned)).total
             return first + self._rendered(method) + FINISH_SWEEPS * self.pace(FistaTv(), of_trial=True).each
-        return 0.0 if getattr(method, "trial_sweeps", 0) else self.of(method).most
+        return 0.0 if method.trial_sweeps else self.of(method).most
 
 
 def part_of(geometry: Geometry, grid: Grid, voxels: int | None, most_rows: int = _ROWS) -> ReconProblem:

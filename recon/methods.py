@@ -5,7 +5,7 @@ A line says where the method's class is, so that its name is known without loadi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from importlib import import_module
 from typing import Any
@@ -46,12 +46,14 @@ BASELINE = "fbp"  # Reports compare all methods with this one
 
 def _made(name: str, method: type[Method]) -> MethodEntry:
     """The line of another package's method."""
+    if not issubclass(method, Method):
+        raise ValueError("its class has no kind of recon.base.method_kinds as a base")
     if method.name != name:
         raise ValueError(f"its class calls itself {method.name!r}; expected the entry point's name")
     entry = MethodEntry(method.__module__, method.__name__, hasattr(method, "stream"))
     if getattr(import_module(entry.module), entry.cls, None) is not method:
         raise ValueError(f"its class {method.__qualname__} is not at the top of the module {entry.module}")
-    _ = method(), method.label, method.traits.direct  # every setting has a default
+    _ = method(), method.label  # every setting has a default
     return entry
 
 
@@ -96,7 +98,7 @@ def by_name(name: str) -> type[Method]:
 
 def taking(field: str) -> tuple[str, ...]:
     """Names of the methods that have a setting, such as "iterations", or "fit.loss" of a nested one."""
-    return tuple(name for name in METHODS if has_setting(by_name(name), field))
+    return names_where(lambda method: has_setting(method, field))
 
 
 def has_setting(method: type[Method], field: str) -> bool:
@@ -149,6 +151,11 @@ def with_settings(method: Any, settings: Mapping[str, Any]) -> Any:
     )
 
 
-def with_trait(trait: str) -> tuple[str, ...]:
-    """Names of the methods with a trait, a field of `recon.base.method.Traits`."""
-    return tuple(name for name in METHODS if getattr(by_name(name).traits, trait))
+def names_where(holds: Callable[[type[Method]], object]) -> tuple[str, ...]:
+    """Names of the methods of which this holds."""
+    return tuple(name for name in METHODS if holds(by_name(name)))
+
+
+def accepting(argument: str) -> tuple[str, ...]:
+    """Names of the methods that accept an argument, see `Method.takes`."""
+    return names_where(lambda method: argument in method.takes)

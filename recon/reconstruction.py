@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from recon.base.arrays import some_values, without_mask
-from recon.base.declared_types import Natural, check_arguments
+from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry, require_views, unseen_axis
 from recon.base.masks import RayWeights
 from recon.base.method import (
@@ -20,13 +20,12 @@ from recon.base.method import (
     ReconProblem,
     Reconstruction,
     RunControl,
-    candidates_of,
-    setting,
 )
+from recon.base.setting import Natural
 from recon.base.units import warn_of_degrees, warn_of_other_quantity
 from recon.base.view_data import Views
 from recon.base.volume import Grid
-from recon.methods import DEFAULT, by_name, with_trait
+from recon.methods import DEFAULT, accepting, by_name
 from recon.prep.counts import Counts, line_integrals
 from recon.voxels.beyond_field import run_on_extended_grid
 
@@ -85,7 +84,7 @@ def reconstruct(
         data = _line_integrals(projections, geometry)
         warn_of_other_quantity(data)
         _warn_of_unknown(data, use.weights)
-    if not setting(chosen, "allow_negative", False):  # a method with that setting may be asked for such voxels
+    if not chosen.allow_negative:  # a method with that setting may be asked for such voxels
         _warn_of_negative(data)
     warn_of_degrees(geometry.angles)
     _warn_of_unseen_cone(chosen, geometry)
@@ -126,7 +125,7 @@ def _warn_of_negative(data: NDArray[np.float32]) -> None:
 
 def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
     lean = geometry.unseen_cone
-    if lean and any(_chooses_prior(each) for each in candidates_of(method)):
+    if lean and any(each.trial_sweeps for each in method.alternatives):
         warnings.warn(
             f"the rotation axis leans along the beam by {math.degrees(lean):.3g} degrees or more in all views: none "
             "measures structure along the axis, as the faces of a plate, and views held out choose too light a weight "
@@ -134,11 +133,6 @@ def _warn_of_unseen_cone(method: Method, geometry: Geometry) -> None:
             "edges",
             stacklevel=3,
         )
-
-
-def _chooses_prior(method: Method) -> bool:
-    """Whether views held out choose a weight of total variation: its own, or that of the finish of a fit."""
-    return bool(getattr(method, "trial_sweeps", 0) or getattr(method, "finish_sweeps", 0))
 
 
 def _refuse_geometry(geometry: Geometry) -> None:
@@ -160,13 +154,13 @@ def _refuse_foreign(method: Method, device: str, use: DataUse, control: RunContr
     wanted = {
         f"device {device!r}": ("device", device != "cpu"),
         "held_out": ("held_out", len(use.held_out) > 0),
-        "times": ("in_time", use.times is not None),
+        "times": ("times", use.times is not None),
         "resume": ("checkpoints", control.resume is not None),
         "on_checkpoint": ("checkpoints", control.on_checkpoint is not None),
     }
-    foreign = [(what, trait) for what, (trait, given) in wanted.items() if given and not getattr(method.traits, trait)]
+    foreign = [(what, taken) for what, (taken, given) in wanted.items() if given and taken not in method.takes]
     if foreign:
-        owners = ", ".join(f"{what} (of {', '.join(with_trait(trait))})" for what, trait in foreign)
+        owners = ", ".join(f"{what} (of {', '.join(accepting(taken))})" for what, taken in foreign)
         raise ValueError(f"method {method.name!r} has no option {owners}: leave that out, or choose another method")
 
 

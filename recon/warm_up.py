@@ -14,13 +14,14 @@ from numba.core import event
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry, arrays_of
 from recon.base.method import DataUse, Method
+from recon.base.method_kinds import Series
 from recon.base.volume import Grid
 from recon.methods import DEFAULT, by_name
 from recon.reconstruction import reconstruct
-from recon.splatting.fit_method import FitMethod
+from recon.splatting.fit_method import Fit
 from recon.voxels.back_project import compile_gridding
 from recon.voxels.fbp import is_gridded
-from recon.voxels.view_weights import cone_weights, missing_arc
+from recon.voxels.view_weights import missing_arc
 
 _SHAPE, _VIEWS = (12, 16), 4
 _SEVERAL = 12  # times these views, for methods of several volumes
@@ -54,13 +55,13 @@ def warm_up(
         ValueError: the method does not take such views.
     """
     method = method or by_name(DEFAULT)()
-    if method.traits.direct and geometry is not None and geometry.is_cone and missing_arc(geometry) > 0:
-        cone_weights(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
-    data, views = toy_of(geometry, _SEVERAL if method.traits.in_time else 1)
+    if geometry is not None:
+        method.views_wanted(geometry)  # refuses these views by the degrees that they lack, the toy by those of the toy
+    data, views = toy_of(geometry, _SEVERAL if isinstance(method, Series) else 1)
     where = str([value.tolist() for value in arrays_of(views).values()])
     with counted(on_kernel or (lambda n: None)):
         # A fit may end with patches.
-        for warmed in (method, by_name("pnp-dct")()) if isinstance(method, FitMethod) else (method,):
+        for warmed in (method, by_name("pnp-dct")()) if isinstance(method, Fit) else (method,):
             toy = warmed.toy()
             if (key := (type(toy), repr(toy), where, device, weighted)) not in _RECONSTRUCTED:
                 _reconstruct_silently(toy, data, views, device, weighted)

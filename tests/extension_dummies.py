@@ -27,15 +27,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from recon.base.method import Reconstruction, Traits
+from recon.base.method import Reconstruction
+from recon.base.method_kinds import Direct
 from recon.base.volume import Volume
 
 
 @dataclass(frozen=True)
-class Grey:
+class Grey(Direct):
     name: ClassVar[str] = "grey"
     label: ClassVar[str] = "Grey"
-    traits: ClassVar[Traits] = Traits(direct=True)
     iterations: int = 1
     shade: float = 0.5
 
@@ -88,11 +88,10 @@ CHECK = Extension(
 """A check that flags every second frame."""
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
-
-from pydantic import Field
+from typing import ClassVar
 
 from beamline.monitor.check import Flag, Level, CheckResult, Policy
+from recon.base.setting import setting
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ class Dummy:
     unit: ClassVar[str] = "frames"
     meaning: ClassVar[str] = "the frame is one of a pair"
     policy: ClassVar[Policy] = Policy.LOG
-    every: Annotated[int, Field(ge=2, description="frames between two flags")] = 3
+    every: int = setting(3, "frames between two flags", ge=2)
 
     def start(self):
         return 0
@@ -246,7 +245,8 @@ from typing import ClassVar
 
 import serial
 
-from drivers.stages.settings import StageFigures, Wiring, key
+from drivers.stages.settings import StageFigures, Wiring
+from recon.base.setting import setting
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -254,7 +254,7 @@ class TurnSettings(Wiring, StageFigures):
     """A dummy."""
 
     pulse_output: ClassVar[None] = None
-    gear: int = key(2, "Counts a step.", ge=1)
+    gear: int = setting(2, "Counts a step.", ge=1)
 
     def limits(self):
         return self.limits_with(self.acceleration, 0.0)

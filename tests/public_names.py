@@ -42,8 +42,10 @@ FOR_PACKAGES = {
     "beamline.scenes.scene_file": ("open_scene",),
     "beamline.scan.control": ("State", "Verb", "ask"),
     "beamline.scan.runs": ("newest",),
-    "recon.base.method": ("Method", "ReconProblem", "Traits"),
+    "recon.base.method": ("Method", "ReconProblem"),
+    "recon.base.method_kinds": ("Direct", "Iterative", "Series"),
     "recon.base.masks": ("masked",),
+    "recon.base.setting": ("Setting", "setting"),
     "recon.base.view_data": ("Views",),
     "recon.splatting.initialise": ("first_volume",),
     "recon.voxels.voxel_problem": ("density_unit",),
@@ -67,7 +69,7 @@ FOR_PACKAGES = {
         "TriggerTrain",
     ),
     "beamline.config.devices": ("CameraDriver",),
-    "drivers.stages.settings": ("StageDriver", "StageSettings", "key"),
+    "drivers.stages.settings": ("StageDriver", "StageSettings"),
     "drivers.testing.camera": ("CameraConformance",),
     "drivers.testing.stages": ("StageConformance", "StepStageConformance"),
     "recon.post": ("clusters",),
@@ -105,7 +107,7 @@ def members(cls: type) -> Iterator[str]:
     """Fields and methods that a class has of us, not of Python or of a library; of a method its settings alone."""
     fields = {each.name for each in dataclasses.fields(cls)} if dataclasses.is_dataclass(cls) else set[str]()
     own = {name for base in cls.__mro__ if base.__module__.split(".")[0] in _OURS for name in vars(base)}
-    for name in sorted(fields if fields and "traits" in own else fields | own):
+    for name in sorted(fields if fields and "takes" in own else fields | own):
         if not name.startswith("_"):
             member = inspect.getattr_static(cls, name, None)
             is_called = isinstance(member, staticmethod | classmethod) or inspect.isfunction(member)

@@ -25,7 +25,7 @@ from recon.base.choices import AUTO, KERNEL, Loss, Start
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.kernel import Kernel
 from recon.base.method import Method, Plain
-from recon.methods import METHODS, build, by_name, has_setting, taking, with_trait
+from recon.methods import METHODS, accepting, build, by_name, has_setting, taking
 
 
 def checkpoint_output(path: Path) -> Path:
@@ -69,7 +69,7 @@ def takers(option: Declared) -> tuple[str, ...]:
         return taking(option.setting)
     from recon.auto import Auto  # here, because it loads all methods
 
-    return (*((AUTO,) if getattr(Auto.traits, option.trait) else ()), *with_trait(option.trait))
+    return (*((AUTO,) if option.argument in Auto.takes else ()), *accepting(option.argument))
 
 
 def refuse_other_methods(command: click.Command, given: Collection[str], method: str, *, stated: bool) -> None:
@@ -78,7 +78,7 @@ def refuse_other_methods(command: click.Command, given: Collection[str], method:
     Args:
         stated: somebody chose the method; else it is the default.
     """
-    of_methods = {name: param for name, param in declared(command).items() if param.setting or param.trait}
+    of_methods = {name: param for name, param in declared(command).items() if param.setting or param.argument}
     asked = {name: param for name, param in of_methods.items() if name in given}
     if method in METHODS and all(param.setting for param in asked.values()):
         own = by_name(method)
@@ -254,7 +254,7 @@ method_options = together(
     ),
     option(
         "--budget",
-        trait="budget",
+        argument="budget",
         excludes={"quality": "give one of them", **_BY_SECONDS},
         callback=parsed(parse_budget),
         metavar="30s|2m|1h",
@@ -262,7 +262,7 @@ method_options = together(
     ),
     option(
         "--quality",
-        trait="presets",
+        argument="quality",
         excludes=_BY_SECONDS,
         type=NameChoice(list(PRESETS)),
         help="Preset of steps and Gaussians; of auto, of what is tried.",
@@ -292,7 +292,7 @@ method_options = together(
     heading(RESOURCES),
     option(
         "--device",
-        trait="device",
+        argument="device",
         excludes=_FINISHED,
         default="cpu",
         show_default=True,
@@ -311,7 +311,7 @@ method_options = together(
     heading(OUTPUT),
     option(
         "--checkpoint",
-        trait="checkpoints",
+        argument="checkpoints",
         excludes=_FINISHED,
         of_one_call=True,
         type=click.Path(path_type=Path, dir_okay=False),
@@ -320,7 +320,7 @@ method_options = together(
     ),
     option(
         "--resume",
-        trait="checkpoints",
+        argument="checkpoints",
         excludes=_FINISHED,
         of_one_call=True,
         callback=checkpoint_input,

@@ -80,7 +80,7 @@ class Declared(click.Option):
 
     Args:
         setting: it is of the methods with this setting, by its path in Python, such as `fit.loss`.
-        trait: it is of the methods with this trait, where it is no setting of theirs.
+        argument: it is of the methods that take this beside their settings, see `Method.takes`.
         inverted: it is a flag that switches the setting off.
         excludes: long names of options that do not go with it, and why.
         needs: another option, without which this one means nothing, and the end of the sentence that says so.
@@ -92,7 +92,7 @@ class Declared(click.Option):
         self,
         *args: Any,
         setting: str = "",
-        trait: str = "",
+        argument: str = "",
         inverted: bool = False,
         excludes: Mapping[str, str] = MappingProxyType({}),
         needs: tuple[str, str] | None = None,
@@ -101,7 +101,7 @@ class Declared(click.Option):
         **kwargs: Any,
     ) -> None:
         super().__init__(*args, **kwargs)
-        self.setting, self.trait, self.inverted = setting, trait, inverted
+        self.setting, self.argument, self.inverted = setting, argument, inverted
         self.excludes, self.needs, self.of_one_call, self.former = excludes, needs, of_one_call, former
 
     def add_to_parser(self, parser: Any, ctx: click.Context) -> None:

@@ -97,7 +97,7 @@ def options_of(context: click.Context, default: str = "", *, there: bool = False
     source, selection = chosen(file, values["seed"], values)
     settings = settings_of(context.command, dict(values)) | {"filter": values["filter"]}
     built = method_with(method, settings, values["any_setting"])
-    if values["region"] is not None and values["max_residual"] is not None and built.traits.direct:
+    if values["region"] is not None and values["max_residual"] is not None and built.makes_boxes:
         raise click.UsageError("--max-residual needs the whole volume; fbp with --roi makes only the box.")
     same = {each.name: values[each.name] for each in fields(ReconOptions) if each.name in values}
     return ReconOptions(**same | {
@@ -123,7 +123,7 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     method = values["method"]
     stated = method is not None
     if method is None:
-        of_a_method = {name for name, param in declared(context.command).items() if param.setting or param.trait}
+        of_a_method = {name for name, param in declared(context.command).items() if param.setting or param.argument}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget", "quality"}
         method = default or (_in_time() if "time" in asked else DEFAULT if of_fits else AUTO)
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {values['resume']}"})
@@ -177,7 +177,7 @@ def run_reconstruction(
         Of several volumes there are some from the first trial on.
         """
         of_bars = isinstance(event, StateEntered) and event.state == "error_bars"
-        if of_bars or (isinstance(event, FitReached) and (not event.unit or options.method.traits.in_time)):
+        if of_bars or (isinstance(event, FitReached) and (not event.unit or options.method.volumes > 1)):
             stop.ready = True
 
     with events_shown(values["as_json"]) as shown:

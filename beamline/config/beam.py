@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, model_validator
 
 from beamline.config.section import Section
 from beamline.config.stages import StageConfig
@@ -16,16 +16,15 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import BeamMonitor, ConnectedFilter, ConnectedMonochromator, ConnectedShutter
 from drivers.in_beam import INSIDE, OUTSIDE, PlacedStage, StagePlaces, StageSampleMover
+from recon.base.setting import Setting, setting
 
-Name = Annotated[str, Field(min_length=1, max_length=80)]
+Name = Annotated[str, Setting(min_length=1, max_length=80)]
 
 
 class MotorSection(Section):
     """A separate motor, of any kind of stage. A linear axis has its own unit (mm, say) wherever a key says deg."""
 
-    speed_deg_s: Annotated[float, Field(gt=0)] | None = Field(
-        default=None, description="null: the stage's max_speed_deg_s."
-    )
+    speed_deg_s: float | None = setting(None, "null: the stage's max_speed_deg_s.", gt=0)
     stage: Annotated[StageConfig, Field(discriminator="kind")]
 
     def refuse_unreachable(self, places: Mapping[str, float]) -> None:
@@ -52,12 +51,14 @@ class StageMover(MotorSection):
     """A motor that moves the sample out of the beam for flats, between two positions."""
 
     kind: Literal["stage"]
-    in_deg: float = Field(description="Where the sample is in the beam.")
-    out_deg: float = Field(description="Where flats are taken.")
-    mm_per_deg: Annotated[float, Field(ge=-1e3, le=1e3)] | None = Field(
-        default=None,
-        description="mm towards higher columns of the frame that a unit of the axis moves the sample; null: "
+    in_deg: float = setting(doc="Where the sample is in the beam.")
+    out_deg: float = setting(doc="Where flats are taken.")
+    mm_per_deg: float | None = setting(
+        None,
+        "mm towards higher columns of the frame that a unit of the axis moves the sample; null: "
         "unknown, or not across.",
+        ge=-1e3,
+        le=1e3,
     )
 
     @model_validator(mode="after")
@@ -87,7 +88,7 @@ class NamedFilter(Section):
     """A filter that has only names: simulated without an effect on the light, or changed by the operator."""
 
     kind: Literal["simulated", "manual"]
-    places: Annotated[tuple[Name, ...], Field(min_length=1)]
+    places: Annotated[tuple[Name, ...], Setting(min_length=1)]
 
     @model_validator(mode="after")
     def _each_once(self) -> Self:
@@ -100,7 +101,7 @@ class MotorFilter(MotorSection):
     """Filters on a motor."""
 
     kind: Literal["stage"]
-    places: Annotated[dict[Name, float], Field(min_length=1)] = Field(description="Name: deg.")
+    places: dict[Name, float] = setting(doc="Name: deg.", min_length=1)
 
     @model_validator(mode="after")
     def _places_can_be_reached(self) -> Self:
@@ -138,20 +139,18 @@ class BeamMonitorSection(Section):
     """Name of its simulated counterpart, which has the port sim:// with this name; None if it has none."""
 
     unit: str
-    scale: PositiveFloat = Field(default=1.0, description="What the number is multiplied by to be in `unit`.")
-    timeout_s: Annotated[float, Field(gt=0, le=1e6)] = 2.0
-    period_s: Annotated[float, Field(gt=0, le=1e6)] = Field(
-        default=1.0, description="Between readings while a scan runs (real time); they are kept in the scan's file."
+    scale: float = setting(1.0, "What the number is multiplied by to be in `unit`.", gt=0)
+    timeout_s: float = setting(2.0, gt=0, le=1e6)
+    period_s: float = setting(
+        1.0, "Between readings while a scan runs (real time); they are kept in the scan's file.", gt=0, le=1e6
     )
-    pause_below: PositiveFloat | None = Field(
-        default=None, description="In `unit`: a scan pauses while there is less; null: it never does."
+    pause_below: float | None = setting(
+        None, "In `unit`: a scan pauses while there is less; null: it never does.", gt=0
     )
-    resume_above: PositiveFloat | None = Field(
-        default=None, description="In `unit`: from here on there is beam again; null: a tenth above pause_below."
+    resume_above: float | None = setting(
+        None, "In `unit`: from here on there is beam again; null: a tenth above pause_below.", gt=0
     )
-    settle_s: Annotated[float, Field(ge=0)] = Field(
-        default=5.0, description="For which there must be beam again before the scan goes on."
-    )
+    settle_s: float = setting(5.0, "For which there must be beam again before the scan goes on.", ge=0)
 
     @model_validator(mode="after")
     def _resumes_where_it_would_not_pause(self) -> Self:
@@ -186,9 +185,9 @@ class StageOutputShutter(Section):
     """A shutter on a digital output of the stage's controller, if the controller has outputs that can be set."""
 
     kind: Literal["stage_output"]
-    output: PositiveInt = Field(description="Number of the output; not the one that the trigger pulses come from.")
-    open_high: bool = Field(default=True, description="A high output opens.")
-    settle_s: Annotated[float, Field(ge=0)] = Field(default=0.1, description="How long the blade travels.")
+    output: int = setting(doc="Number of the output; not the one that the trigger pulses come from.", gt=0)
+    open_high: bool = setting(True, "A high output opens.")
+    settle_s: float = setting(0.1, "How long the blade travels.", ge=0)
 
 
 class FoundShutter(Section):
@@ -202,7 +201,7 @@ class FoundShutter(Section):
         raise NotImplementedError
 
 
-Kev = Annotated[float, Field(gt=0, le=1e6)]
+Kev = Annotated[float, Setting(gt=0, le=1e6)]
 
 
 class NoMonochromator(Section):
@@ -210,9 +209,7 @@ class NoMonochromator(Section):
 
 
 class _Monochromator(Section):
-    range_kev: tuple[Kev, Kev] | None = Field(
-        default=None, description="Lowest and highest energy that a scan may ask for; null: any."
-    )
+    range_kev: tuple[Kev, Kev] | None = setting(None, "Lowest and highest energy that a scan may ask for; null: any.")
 
     @model_validator(mode="after")
     def _range_rises(self) -> Self:
@@ -226,7 +223,7 @@ class SceneMonochromator(_Monochromator):
     """Sets the energy of the simulated beam, which starts at that of the scene."""
 
     kind: Literal["simulated"]
-    settle_s: Annotated[float, Field(ge=0, le=1e6)] = Field(default=1.0, description="Time that each move takes.")
+    settle_s: float = setting(1.0, "Time that each move takes.", ge=0, le=1e6)
 
 
 class HandMonochromator(_Monochromator):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self, Union
 
-from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
+from pydantic import Field, model_validator
 
 from beamline.config.beam import (
     BeamMonitorSection,
@@ -28,15 +28,15 @@ from drivers import orca_quest
 from drivers.base.clock import Clock
 from drivers.base.protocols import Camera, CameraSettings, CameraTiming
 from drivers.orca_quest import DcamOptions
-from drivers.stages.settings import with_keys
 from recon.base.registry import Registry, in_folders
+from recon.base.setting import Setting, setting
 
 
 class CameraDriver(Protocol):
     """A driver's class, which the entry point of a package names.
 
     Attributes:
-        Settings: a frozen dataclass of its settings; fields say with `drivers.stages.settings.key` how a configuration
+        Settings: a frozen dataclass of its settings; fields declare by a `Setting` how a configuration
         writes them.
     """
 
@@ -49,18 +49,18 @@ class CameraDriver(Protocol):
         """The camera's timing, before it is connected. Raises ValueError for settings that it would refuse."""
 
 
-CAMERAS: Registry[CameraDriver] = Registry("camera", {}, with_keys, reserved=("dcam", "simulated_orca"))
+CAMERAS: Registry[CameraDriver] = Registry("camera", {}, reserved=("dcam", "simulated_orca"))
 """Kind in a configuration -> the driver."""
 
 
 Roi = Annotated[
     tuple[
-        Annotated[int, Field(ge=0)],
-        Annotated[int, Field(ge=0)],
-        Annotated[int, Field(ge=1)],
-        Annotated[int, Field(ge=1)],
+        Annotated[int, Setting(ge=0)],
+        Annotated[int, Setting(ge=0)],
+        Annotated[int, Setting(ge=1)],
+        Annotated[int, Setting(ge=1)],
     ],
-    Field(description="row0, col0, rows, cols on the sensor, all multiples of 4"),
+    Setting("row0, col0, rows, cols on the sensor, all multiples of 4"),
 ]
 
 
@@ -68,20 +68,18 @@ class _Orca(Section):
     """The keys that the real and the simulated ORCA-Quest share."""
 
     kind: str
-    model: Literal["C15550-20UP", "C15550-22UP"] = Field(
-        default="C15550-20UP",
-        description="ORCA-Quest, or ORCA-Quest 2, which reads ultra quiet five times as fast; plans and "
-        "simulations go by it.",
+    model: Literal["C15550-20UP", "C15550-22UP"] = setting(
+        "C15550-20UP",
+        "ORCA-Quest, or ORCA-Quest 2, which reads ultra quiet five times as fast; plans and simulations go by it.",
     )
-    roi: Roi | None = Field(default=None, description="null: the full sensor, 2304 x 4096.")
+    roi: Roi | None = setting(None, "null: the full sensor, 2304 x 4096.")
     binning: Literal[1, 2, 4] = 1
-    readout: Literal["standard", "ultra_quiet", "photon_number"] = Field(
-        default="standard", description="photon_number: the camera counts photoelectrons, at the pace of ultra_quiet."
+    readout: Literal["standard", "ultra_quiet", "photon_number"] = setting(
+        "standard", "photon_number: the camera counts photoelectrons, at the pace of ultra_quiet."
     )
-    trigger_polarity: Literal["positive", "negative"] = Field(
-        default="positive",
-        description="The edge that counts; a camera that was just switched on takes negative, the driver sets "
-        "what stands here.",
+    trigger_polarity: Literal["positive", "negative"] = setting(
+        "positive",
+        "The edge that counts; a camera that was just switched on takes negative, the driver sets what stands here.",
     )
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:
@@ -95,21 +93,19 @@ class SimulatedOrca(_Orca):
 
 class DcamOrca(section_of("DcamOrcaKeys", _Orca, declared(DcamOptions))):  # type: ignore[misc]
     kind: Literal["dcam"]
-    library: str | None = Field(default=None, description="Path of the DCAM-API library; null: the installed one.")
-    index: Annotated[int, Field(ge=0)] = Field(default=0, description="Which camera, where DCAM finds several.")
-    link: Literal["usb3", "coaxpress"] = Field(
-        default="usb3", description="USB3 carries 17.7 full frames a second, CoaXPress 120."
+    library: str | None = setting(None, "Path of the DCAM-API library; null: the installed one.")
+    index: int = setting(0, "Which camera, where DCAM finds several.", ge=0)
+    link: Literal["usb3", "coaxpress"] = setting("usb3", "USB3 carries 17.7 full frames a second, CoaXPress 120.")
+    cool_s: float = setting(
+        0.0, "Wait at most so long for the sensor to be cold before a scan; 0: do not wait.", ge=0, le=1e6
     )
-    cool_s: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        default=0.0, description="Wait at most so long for the sensor to be cold before a scan; 0: do not wait."
+    usb_product: int | None = setting(
+        None,
+        "USB product id, for `check --connect`; null: any of the vendor's (which makes other things too).",
+        ge=0,
+        le=0xFFFF,
     )
-    usb_product: Annotated[int, Field(ge=0, le=0xFFFF)] | None = Field(
-        default=None,
-        description="USB product id, for `check --connect`; null: any of the vendor's (which makes other things too).",
-    )
-    usb_serial: str | None = Field(
-        default=None, description="USB serial number, for `check --connect`, where there are several cameras."
-    )
+    usb_serial: str | None = setting(None, "USB serial number, for `check --connect`, where there are several cameras.")
 
     @property
     def options(self) -> DcamOptions:
@@ -125,10 +121,16 @@ class PluggedCamera(Section):
     """A camera of another package, with the keys that its settings declare."""
 
     kind: str
-    roi: tuple[NonNegativeInt, NonNegativeInt, PositiveInt, PositiveInt] | None = Field(
-        default=None, description="row0, col0, rows, cols on the sensor; null: all of it."
-    )
-    binning: PositiveInt = 1
+    roi: (
+        tuple[
+            Annotated[int, Setting(ge=0)],
+            Annotated[int, Setting(ge=0)],
+            Annotated[int, Setting(gt=0)],
+            Annotated[int, Setting(gt=0)],
+        ]
+        | None
+    ) = setting(None, "row0, col0, rows, cols on the sensor; null: all of it.")
+    binning: int = setting(1, gt=0)
     readout: str = "standard"
 
     def timing_of(self, wanted: CameraSettings) -> CameraTiming:

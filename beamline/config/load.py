@@ -27,7 +27,7 @@ from beamline.config.models import (
     SectorAngles,
 )
 from beamline.config.rehearsal import rehearsal
-from beamline.config.tree import Tree, declared_at, explain, override, read
+from beamline.config.tree import Tree, explain, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
 from beamline.core.installed import config_folder as config_folder
@@ -36,6 +36,7 @@ from beamline.core.quantities import doubt, is_impossible
 from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
+from recon.base.findings import declared_at
 
 NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""

@@ -15,6 +15,7 @@ from beamline.core.files import RUNS
 from beamline.plan.plan import Mode, Place
 from drivers.orca_quest import LightPath
 from recon.base.choices import AUTO
+from recon.base.setting import Setting, setting
 from recon.methods import DEFAULT, names_of_one_volume, streams
 
 if TYPE_CHECKING:
@@ -24,17 +25,19 @@ else:
 
 
 class SampleSection(Section):
-    name: Annotated[str, Field(pattern=r"^\w([\w.+-]*[\w+-])?$", max_length=80)] = Field(
-        description="letters, digits and _ . + - (it ends the run folder's name)"
+    name: str = setting(
+        doc="letters, digits and _ . + - (it ends the run folder's name)",
+        pattern=r"^\w([\w.+-]*[\w+-])?$",
+        max_length=80,
     )
     description: str = ""
-    diameter_mm: Annotated[float, Field(gt=0, le=1e3)] | None = Field(
-        default=None, description="Of the circle about the rotation axis that holds all of the sample; null: not known."
+    diameter_mm: float | None = setting(
+        None, "Of the circle about the rotation axis that holds all of the sample; null: not known.", gt=0, le=1e3
     )
 
 
-Views = Annotated[int, Field(gt=0, le=1_000_000)]
-Degrees = Annotated[float, Field(ge=-1e6, le=1e6)]
+Views = Annotated[int, Setting(gt=0, le=1_000_000)]
+Degrees = Annotated[float, Setting(ge=-1e6, le=1e6)]
 
 
 class _Span(Section):
@@ -85,7 +88,7 @@ class FileAngles(Section):
     """Degrees from a text file, one a line, in the order of acquisition; # starts a comment."""
 
     scheme: Literal["file"]
-    path: str = Field(description="Relative to the configuration file.")
+    path: str = setting(doc="Relative to the configuration file.")
 
 
 AnglesSection = Annotated[
@@ -94,14 +97,14 @@ AnglesSection = Annotated[
 ]
 
 
-Seconds = Annotated[float, Field(gt=0, le=1e6)]
-Column = Annotated[float, Field(ge=-1e7, le=1e7)]
+Seconds = Annotated[float, Setting(gt=0, le=1e6)]
+Column = Annotated[float, Setting(ge=-1e7, le=1e7)]
 
 
 class Fields(Section):
     """Darks or flats: how many at each place, and their own exposure (null: the scan's)."""
 
-    count: Annotated[int, Field(ge=0, le=1_000_000)] = 10
+    count: int = setting(10, ge=0, le=1_000_000)
     at: Place = Place.START
     exposure_s: Seconds | None = None
 
@@ -109,70 +112,66 @@ class Fields(Section):
 class WishSection(Section):
     """What ends a scan that decides, whichever comes first; null: that does not end it."""
 
-    quality_db: Annotated[float, Field(gt=0, le=100)] | None = Field(
-        default=None, description="dB of PSNR by which the volume may stay below that of the whole plan."
+    quality_db: float | None = setting(
+        None, "dB of PSNR by which the volume may stay below that of the whole plan.", gt=0, le=100
     )
-    seconds: Seconds | None = Field(
-        default=None, description="From the first frame to the last flats and darks, at most."
-    )
-    dose: Annotated[float, Field(gt=0, le=1)] | None = Field(
-        default=None, description="Share of the plan's exposures with light on the sample, at most."
-    )
+    seconds: Seconds | None = setting(None, "From the first frame to the last flats and darks, at most.")
+    dose: float | None = setting(None, "Share of the plan's exposures with light on the sample, at most.", gt=0, le=1)
 
 
 class ScanSection(Section):
     mode: Literal[Mode.FLY, Mode.STEP] = Mode.FLY
     angles: AnglesSection
     exposure_s: Seconds
-    period_s: Seconds = Field(
-        description="Time between views: sets the speed of a fly scan, the least time per frame of a step scan."
+    period_s: Seconds = setting(
+        doc="Time between views: sets the speed of a fly scan, the least time per frame of a step scan."
     )
-    frames_per_view: Annotated[int, Field(ge=1, le=1000)] = Field(
-        default=1,
-        description="Frames at each angle of a step scan, which `beamline recon` averages to a view; the file has "
-        "them all.",
+    frames_per_view: int = setting(
+        1,
+        "Frames at each angle of a step scan, which `beamline recon` averages to a view; the file has them all.",
+        ge=1,
+        le=1000,
     )
-    settle_s: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        default=0.1, description="Wait after each move of a step scan."
+    settle_s: float = setting(0.1, "Wait after each move of a step scan.", ge=0, le=1e6)
+    warm_up_s: float = setting(
+        0.0,
+        "Light on the scintillator before frames with light, each time the shutter opens; it glows brighter when warm.",
+        ge=0,
+        le=1e6,
     )
-    warm_up_s: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        default=0.0,
-        description="Light on the scintillator before frames with light, each time the shutter opens; it glows "
-        "brighter when warm.",
+    filter: str | None = setting(
+        None, "Name of one of the places of devices.filter, where it is before the first frame; null: as it stands."
     )
-    filter: str | None = Field(
-        default=None,
-        description="Name of one of the places of devices.filter, where it is before the first frame; null: as it "
-        "stands.",
+    energy: Kev | None = setting(
+        None, "keV to which devices.monochromator goes before the first frame; null: as it stands."
     )
-    energy: Kev | None = Field(
-        default=None, description="keV to which devices.monochromator goes before the first frame; null: as it stands."
+    energies: tuple[Kev, ...] | None = setting(
+        None,
+        "keV of a series: a scan at each, one after the other; each begins a fraction of a step later in angle.",
+        min_length=2,
+        max_length=1000,
     )
-    energies: Annotated[tuple[Kev, ...], Field(min_length=2, max_length=1000)] | None = Field(
-        default=None,
-        description="keV of a series: a scan at each, one after the other; each begins a fraction of a step later "
-        "in angle.",
-    )
-    wide_views: Annotated[int, Field(ge=0, le=100)] = Field(
-        default=0,
-        description="Angles at which a sample wider than the field is stepped across the beam after the views, "
+    wide_views: int = setting(
+        0,
+        "Angles at which a sample wider than the field is stepped across the beam after the views, "
         "until all was shown.",
+        ge=0,
+        le=100,
     )
-    without_watchdog: Literal["warn", "pause"] = Field(
-        default="warn",
-        description="The behaviour of a scan without a watchdog, or with one that ended and could not be replaced.",
+    without_watchdog: Literal["warn", "pause"] = setting(
+        "warn", "The behaviour of a scan without a watchdog, or with one that ended and could not be replaced."
     )
-    decide: Literal["off", "ask", "do"] = Field(
-        default="off",
-        description="What follows each pass of views: the plan (off), what the operator answers (ask), or the best "
+    decide: Literal["off", "ask", "do"] = setting(
+        "off",
+        "What follows each pass of views: the plan (off), what the operator answers (ask), or the best "
         "gain a second until the wish is met (do).",
     )
     wish: WishSection = WishSection(quality_db=1.0)
-    wait_s: Annotated[float, Field(ge=0, le=3600)] = Field(
-        default=30.0, description="Longest wait for a prediction after a pass, and again for the operator's answer."
+    wait_s: float = setting(
+        30.0, "Longest wait for a prediction after a pass, and again for the operator's answer.", ge=0, le=3600
     )
-    pass_views: Annotated[int, Field(ge=0, le=1_000_000)] = Field(
-        default=0, description="Views of a pass of a step scan; a fly scan has the passes of interlaced angles."
+    pass_views: int = setting(
+        0, "Views of a pass of a step scan; a fly scan has the passes of interlaced angles.", ge=0, le=1_000_000
     )
     darks: Fields = Fields()
     flats: Fields = Fields()
@@ -185,61 +184,56 @@ class ScanSection(Section):
 
 
 class OpticsSection(Section):
-    pixel_size_um: Annotated[float, Field(gt=0, le=1e6)] = Field(description="Size of an unbinned pixel at the sample.")
-    energy_kev: Annotated[float, Field(gt=0, le=1e6)] | None = None
-    distance_mm: Annotated[float, Field(ge=0, le=1e7)] | None = Field(default=None, description="Sample to detector.")
-    axis_col: Column | None = Field(
-        default=None,
-        description="Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; "
-        "null: unknown.",
+    pixel_size_um: float = setting(doc="Size of an unbinned pixel at the sample.", gt=0, le=1e6)
+    energy_kev: float | None = setting(None, gt=0, le=1e6)
+    distance_mm: float | None = setting(None, "Sample to detector.", ge=0, le=1e7)
+    axis_col: Column | None = setting(
+        None, "Column of the rotation axis, 0 at the centre of the first column of the (binned) frame; null: unknown."
     )
-    light_path: LightPath | None = Field(
-        default=None, description="From X-ray photons to photoelectrons, for `beamline tune`; null: not known."
+    light_path: LightPath | None = setting(
+        None, "From X-ray photons to photoelectrons, for `beamline tune`; null: not known."
     )
 
 
 class StorageSection(Section):
-    folder: Annotated[str, Field(min_length=1)] = RUNS
-    preview_bin: Annotated[int, Field(gt=0, le=10_000)] = 4
-    flush_every: Annotated[int, Field(gt=0, le=1_000_000)] = Field(
-        default=16,
-        description="Frames that are flushed together, at most, while others wait to be written; else each is "
-        "flushed at once.",
+    folder: str = setting(RUNS, min_length=1)
+    preview_bin: int = setting(4, gt=0, le=10_000)
+    flush_every: int = setting(
+        16,
+        "Frames that are flushed together, at most, while others wait to be written; else each is flushed at once.",
+        gt=0,
+        le=1_000_000,
     )
 
 
 class ReconSection(Section):
-    live: bool = Field(
-        default=True,
-        description="A volume while the scan runs; by a method that needs the whole scan, when it is complete.",
+    live: bool = setting(
+        True, "A volume while the scan runs; by a method that needs the whole scan, when it is complete."
     )
-    method: MethodName = Field(
-        default=DEFAULT,
-        description="r2 grows while the scan runs; the others need the whole scan. auto: as of `beamline recon`.",
+    method: MethodName = setting(
+        DEFAULT, "r2 grows while the scan runs; the others need the whole scan. auto: as of `beamline recon`."
     )
-    seconds: Seconds = Field(
-        default=1800.0,
-        description="Most time after the last view: the volume is made as of a finished scan, and takes longer on "
-        "a busy machine.",
+    seconds: Seconds = setting(
+        1800.0,
+        "Most time after the last view: the volume is made as of a finished scan, and takes longer on a busy machine.",
     )
     axis: Literal["auto"] | Column = "auto"
     seed: int = 0
 
 
 class Speed(Section):
-    speed: Annotated[float, Field(gt=0, le=1e6)] = Field(description="Simulated seconds per real second.")
+    speed: float = setting(doc="Simulated seconds per real second.", gt=0, le=1e6)
 
 
 class SimulationSection(Section):
     """Settings of simulated devices and of rehearsals; a real instrument ignores them."""
 
-    scene: str | dict[str, Any] = Field(
-        default="scenes/battery.yaml",
-        description="A scene file (relative to the configuration file or to the installed configs), or the scene "
-        "itself.",
+    scene: str | dict[str, Any] = setting(
+        "scenes/battery.yaml",
+        "A scene file (relative to the configuration file or to the installed configs), or the scene itself.",
     )
     clock: Literal["real", "virtual"] | Speed = "real"
-    seed: int = Field(0, ge=0, lt=2**63)
+    seed: int = setting(0, ge=0, lt=2**63)
 
 
 class Config(Section):

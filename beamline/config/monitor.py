@@ -10,36 +10,32 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
-from pydantic import AfterValidator, Field
-
 from beamline.config.section import Section, section_of
 from beamline.monitor.check import Check, Policy
 from beamline.monitor.checks import BY_NAME, CHECKS
 from beamline.monitor.references import ReferenceLimits
 from recon.base.registry import unknown
+from recon.base.setting import Setting, setting
 
 
-def _names(retake: bool | tuple[str, ...]) -> bool | tuple[str, ...]:
-    """ValueError for what is no check."""
-    if not isinstance(retake, bool) and (wrong := [name for name in retake if name not in BY_NAME]):
-        raise ValueError(f"{unknown('check', wrong[0], BY_NAME)}; expected a list of these, true or false")
-    return retake
+def _no_checks(retake: bool | tuple[str, ...]) -> str:
+    """What is wrong with names of checks."""
+    wrong = () if isinstance(retake, bool) else [name for name in retake if name not in BY_NAME]
+    return f"{unknown('check', wrong[0], BY_NAME)}; expected a list of these, true or false" if wrong else ""
 
 
 class MonitorBase(Section):
     """The keys that do not depend on the checks."""
 
-    act_after: Annotated[int, Field(ge=1)] = Field(
-        default=10, description="Frames in a row with an alarm before the check's policy pauses or stops the scan."
+    act_after: int = setting(
+        10, "Frames in a row with an alarm before the check's policy pauses or stops the scan.", ge=1
     )
-    retake: Annotated[bool | tuple[str, ...], AfterValidator(_names)] = Field(
-        default=False,
-        description="Views with an alarm or without a frame are taken again, once, after the last view. Names of "
+    retake: Annotated[bool | tuple[str, ...], Setting(problem=_no_checks)] = setting(
+        False,
+        "Views with an alarm or without a frame are taken again, once, after the last view. Names of "
         "checks: those with a warning of these checks, too.",
     )
-    retake_share: Annotated[float, Field(gt=0, le=1)] = Field(
-        default=0.25, description="Share of the views that are taken again at most."
-    )
+    retake_share: float = setting(0.25, "Share of the views that are taken again at most.", gt=0, le=1)
 
     @property
     def retaken_warnings(self) -> frozenset[str]:
@@ -49,7 +45,7 @@ class MonitorBase(Section):
 
 def _keys(limits: type[Any]) -> dict[str, Any]:
     types = get_type_hints(limits, include_extras=True)
-    return {limit.name: (types[limit.name], limit.default) for limit in fields(limits)}
+    return {limit.name: (types[limit.name], limit) for limit in fields(limits)}
 
 
 def _limits_of(check: Check) -> Any:
@@ -86,9 +82,8 @@ def policies(monitor: MonitorBase) -> Mapping[str, Policy]:
 class ReferencesBase(Section):
     """The keys that are not limits."""
 
-    on_fault: Literal["stop", "log"] = Field(
-        default="stop",
-        description="Darks or flats with a fault stop the scan before its first projection, or the fault is logged.",
+    on_fault: Literal["stop", "log"] = setting(
+        "stop", "Darks or flats with a fault stop the scan before its first projection, or the fault is logged."
     )
 
 

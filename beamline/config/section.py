@@ -1,29 +1,18 @@
-"""Section: a frozen group of configuration keys, some of them declared by a driver's settings with `key`."""
+"""Section: a frozen group of configuration keys, some of them declared by a driver's settings."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, fields
+from collections.abc import Mapping
+from dataclasses import MISSING
 from enum import StrEnum
 from pathlib import Path
-from types import NoneType, UnionType
+from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, create_model, model_validator
+from pydantic import BaseModel, ConfigDict, create_model, model_validator
 
-from drivers.keys import Key
-
-
-def without(problem_of: Callable[[str], str]) -> AfterValidator:
-    """A validator that refuses a text for which `problem_of` returns a problem."""
-
-    def checked(text: str) -> str:
-        if problem := problem_of(text):
-            raise ValueError(problem)
-        return text
-
-    return AfterValidator(checked)
+from recon.base.setting import Setting, settings_of
 
 
 def port_problem(port: str) -> str:
@@ -32,7 +21,7 @@ def port_problem(port: str) -> str:
     return f"{port} is no port; expected one such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
 
 
-Port = Annotated[str, Field(min_length=1), without(port_problem)]
+Port = Annotated[str, Setting(min_length=1, problem=port_problem)]
 
 
 class Section(BaseModel):
@@ -54,28 +43,22 @@ class Section(BaseModel):
         return data
 
 
-def _keys(settings: type[Any]) -> Iterator[tuple[str, Key]]:
-    """The fields of a driver's settings with their keys."""
-    return ((field.name, field.metadata["key"]) for field in fields(settings))
-
-
 def declared(settings: type[Any]) -> dict[str, Any]:
-    """Type and default of each key by name, for `section_of`."""
+    """Type and default of the key of each field of a driver's settings, for `section_of`."""
     types = get_type_hints(settings)
-    return {key.name_of(name): _declared(key, types[name]) for name, key in _keys(settings)}
+    return {made.key_of(name): _declared(made, types[name]) for name, made in settings_of(settings).items()}
 
 
 def read_from(section: Section, settings: type[Any]) -> Any:
     """The driver's settings from a section with the same keys."""
-    types = get_type_hints(settings)
-    values = {name: (key, getattr(section, key.name_of(name))) for name, key in _keys(settings)}
-    return settings(**{name: _inside(key, types[name], value) for name, (key, value) in values.items()})
+    types, told = get_type_hints(settings), settings_of(settings).items()
+    return settings(**{name: _inside(made, types[name], getattr(section, made.key_of(name))) for name, made in told})
 
 
-def _inside(key: Key, kind: Any, value: Any) -> Any:
+def _inside(made: Setting, kind: Any, value: Any) -> Any:
     """A key's value for the driver, in the unit and of the type of the field."""
-    made = next((each for each in (kind, *get_args(kind)) if _is(each, StrEnum, Path)), None)
-    return key.inside(value) if made is None or value is None else made(value)
+    cast = next((each for each in (kind, *get_args(kind)) if _is(each, StrEnum, Path)), None)
+    return made.inside(value) if cast is None or value is None else cast(value)
 
 
 def _is(kind: Any, *kinds: type[Any]) -> bool:
@@ -83,21 +66,14 @@ def _is(kind: Any, *kinds: type[Any]) -> bool:
     return isinstance(kind, type) and issubclass(kind, kinds)
 
 
-def _declared(key: Key, kind: Any) -> tuple[Any, Any]:
+def _declared(made: Setting, kind: Any) -> tuple[Any, Any]:
     """Type and default of a field's key, as pydantic takes them."""
-    optional = get_origin(kind) is UnionType and NoneType in get_args(kind)
-    legal: Any = Union[tuple(each for each in get_args(kind) if each is not NoneType)] if optional else kind  # noqa: UP007
-    if _is(legal, StrEnum):
-        legal = Literal[tuple(choice.value for choice in legal)]
-    elif _is(legal, Path):
-        legal = str
-    if key.problem is not None:
-        legal = Annotated[legal, without(key.problem)]
-    if key.bounds:
-        legal = Annotated[legal, Field(**key.bounds)]
-    default = ... if key.default is MISSING else key.default
-    default = default.value if isinstance(default, StrEnum) else default
-    return legal | None if optional else legal, Field(default, description=key.doc or None)
+    members = (
+        Literal[tuple(choice.value for choice in each)] if _is(each, StrEnum) else str if _is(each, Path) else each
+        for each in (get_args(kind) if get_origin(kind) is UnionType else (kind,))
+    )
+    default = made.default.value if isinstance(made.default, StrEnum) else made.default
+    return Annotated[Union[tuple(members)], made], ... if default is MISSING else default  # noqa: UP007
 
 
 def section_of(name: str, base: type[Section], keys: Mapping[str, Any], doc: str | None = None) -> Any:

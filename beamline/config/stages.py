@@ -14,15 +14,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self, Union
 from zlib import crc32
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from beamline.config.section import Port, Section, declared, read_from, section_of
 from beamline.core.machine import state_folder
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
-from drivers.stages.settings import StageDriver, StageSettings, with_keys
+from drivers.stages.settings import StageDriver, StageSettings
 from drivers.stages.shared import LineStage
 from recon.base.registry import Registry, in_folders
+from recon.base.setting import setting
 
 STAGES: Registry[StageDriver] = Registry(
     "stage",
@@ -30,7 +31,6 @@ STAGES: Registry[StageDriver] = Registry(
         kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name)
         for kind, name in in_folders("drivers.stages", "DRIVERS").items()
     },
-    with_keys,
 )
 """Kind, as a configuration names it -> the driver."""
 
@@ -50,9 +50,9 @@ class StageSection(Section):
     """Keys that all stages share. Real ports: COM3, /dev/ttyUSB0, /dev/serial/by-id/..., socket://host:port."""
 
     kind: str
-    port: Port = Field(
-        description="Where its controller is; sim:// and the kind is its simulated counterpart, where it has one; that "
-        "takes all else from here."
+    port: Port = setting(
+        doc="Where its controller is; sim:// and the kind is its simulated counterpart, where it has one; that takes "
+        "all else from here."
     )
 
     @model_validator(mode="after")

@@ -16,9 +16,8 @@ import yaml
 from pydantic import ValidationError
 
 from beamline.core.errors import ConfigError
-from recon.base.registry import did_you_mean
+from recon.base.findings import KeyPath, Schema, faults_of
 
-KeyPath = tuple[str | int, ...]
 ENVIRONMENT_PREFIX = "BEAMLINE_"
 _NOTHING = ("", "null", "~")
 YAML_FAULTS = (ValueError, ArithmeticError, LookupError, TypeError, AttributeError)
@@ -212,7 +211,6 @@ def override(
     return Tree(data, origins)
 
 
-Schema = Mapping[str, Any]
 _OWN_VIEWS = "Every reconstruction of 25 views or more compares its own views"
 REMOVED = {
     "monitor.model": _OWN_VIEWS,
@@ -223,149 +221,14 @@ REMOVED = {
     "scan.return_views": "The check `opposite` shows motion of the sample, by views half a turn apart",
 }
 """Keys of 1.0.0 that were removed, each with what does the same."""
-_OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
+_ADVICE = "A real configuration runs with simulated devices as it is: `beamline scan CONFIG --rehearse`"
 
 
 def explain(error: ValidationError, tree: Tree, schema: Schema) -> list[str]:
-    """One line for each fault, in the order of the model's keys; one fault per key.
+    """One line for each fault, with its place, in the order of the model's keys; one fault per key.
 
     Args:
         schema: the model's JSON schema, from which the legal keys and values are read.
     """
-    faults: dict[KeyPath, str] = {}
-    for finding in error.errors(include_url=False):
-        missing = finding["type"] == "missing" and isinstance(finding["loc"][-1], str)  # not a missing item of a list
-        path = _path(finding["loc"], tree.data, missing)
-        if finding["type"].startswith("union_tag"):
-            path = (*path, finding["ctx"]["discriminator"].strip("'"))
-            missing = finding["type"] == "union_tag_not_found"
-        sentence = _sentence("missing" if missing else finding["type"], path, finding["msg"], tree.data, schema)
-        place = tree.origin((*path, *_key_named(finding["type"], finding["msg"])))
-        if not any(text.endswith(f": {sentence}") for text in faults.values()):  # one for all keys of a real device
-            faults.setdefault(path, f"{place}: {sentence}")
-    # A list with a wrong item may also seem too short.
-    lists = {path for path in faults if isinstance(_value(tree.data, path), list)}
-    items = {path[:-1] for path in faults if path}
-    return [text for path, text in faults.items() if path not in lists & items]
-
-
-def _path(loc: Sequence[str | int], data: Any, missing: bool) -> KeyPath:
-    """The key path in the file: pydantic's location without the names of union members."""
-    path: list[str | int] = []
-    for at, part in enumerate(loc):
-        if _has(data, part):
-            data = data[part]
-            path.append(part)
-        elif missing and at == len(loc) - 1:
-            path.append(part)
-    return tuple(path)
-
-
-def _has(data: Any, part: str | int) -> bool:
-    if isinstance(data, list):
-        return isinstance(part, int) and part < len(data)
-    return isinstance(data, dict) and part in data
-
-
-def _key_named(kind: str, message: str) -> KeyPath:
-    """The path of the key, within its group, with which the message of a group's validator begins."""
-    words = message.removeprefix(_OF_VALIDATOR).split(maxsplit=1)
-    return tuple(words[0].rstrip(":,").split(".")) if kind == "value_error" and words else ()
-
-
-def _sentence(kind: str, path: KeyPath, message: str, data: Any, schema: Schema) -> str:
-    name = ".".join(map(str, path)) or "the configuration"
-    if kind == "value_error":
-        sentence = message.removeprefix(_OF_VALIDATOR)
-        return f"{name}: {sentence}" if path else sentence
-    if kind == "extra_forbidden" and name in REMOVED:
-        return f"{name} is no longer a key; leave it out. {REMOVED[name]}"
-    if kind == "extra_forbidden":
-        keys = [key for branch in declared_at(schema, path[:-1], data) for key in branch.get("properties", {})]
-        others = [key for key in _value(data, path[:-1]) if key not in keys]
-        if len(others) > 2:
-            return (
-                f"{'.'.join(map(str, path[:-1]))}: {', '.join(others)} are no keys of this kind; leave them out. A "
-                "real configuration runs with simulated devices as it is: `beamline scan CONFIG --rehearse`"
-            )
-        return f"{name} is not a known key{did_you_mean(path[-1], keys)}; legal keys there: {', '.join(keys)}"
-    branches = declared_at(schema, path, data)
-    choices = [str(choice) for branch in branches for choice in _choices(branch)]
-    words = [_words(branch) for branch in branches if not _choices(branch)]
-    legal = " | ".join(dict.fromkeys([*choices, *words]))
-    if kind == "missing" and (not path or not _has(_value(data, path[:-1]), path[-1])):
-        return f"{name} is missing; expected {legal}"
-    data = _value(data, path)
-    return f"{name} is {_shown(data)}{did_you_mean(data, choices)}; expected {legal}"
-
-
-def _value(data: Any, path: KeyPath) -> Any:
-    for part in path:
-        data = data[part] if _has(data, part) else None
-    return data
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, str):
-        text = repr(value)
-    else:
-        text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def declared_at(schema: Schema, path: KeyPath, data: Any) -> list[Schema]:
-    """The schemas for the value at `path`, by the kinds and schemes that the data choose."""
-    branches = _branches(schema, data, schema)
-    for part in path:
-        data = data[part] if _has(data, part) else None
-        children = [child for branch in branches if (child := _child(branch, part)) is not None]
-        branches = [branch for child in children for branch in _branches(child, data, schema)]
-    return branches
-
-
-def _branches(node: Schema, data: Any, root: Schema) -> list[Schema]:
-    """The alternatives of a node, with references resolved; only the one whose tag the data name, if they do."""
-    while "$ref" in node:
-        node = root["$defs"][node["$ref"].rsplit("/", 1)[1]]
-    alternatives = node.get("anyOf") or node.get("oneOf")
-    if alternatives is None:
-        return [node]
-    branches = [branch for alternative in alternatives for branch in _branches(alternative, data, root)]
-    tag = node.get("discriminator", {}).get("propertyName")
-    if tag is None or not isinstance(data, dict):
-        return branches
-    return [b for b in branches if data.get(tag) in _choices(b["properties"][tag])] or branches
-
-
-def _child(branch: Schema, part: str | int) -> Schema | None:
-    if isinstance(part, int):
-        items: Sequence[Schema] = branch.get("prefixItems", [])
-        return items[part] if part < len(items) else branch.get("items")
-    extra = branch.get("additionalProperties")
-    return branch.get("properties", {}).get(part) or (extra if isinstance(extra, dict) else None)
-
-
-def _choices(branch: Schema) -> list[Any]:
-    return branch.get("enum", [branch["const"]] if "const" in branch else [])
-
-
-def _words(branch: Schema) -> str:
-    """The legal values, if they are not a short list of choices."""
-    kind = str(branch.get("type"))
-    if kind in ("number", "integer"):
-        text = "a whole number" if kind == "integer" else "a number"
-        bounds = [("exclusiveMinimum", ">"), ("minimum", ">="), ("exclusiveMaximum", "<"), ("maximum", "<=")]
-        limits = " and ".join(f"{sign} {branch[name]:g}" for name, sign in bounds if name in branch)
-        return f"{text} {limits}".strip()
-    if kind == "array" and "items" in branch:
-        return f"a list of {branch.get('minItems', 0)} or more: {_words(branch['items'])}"
-    if kind == "array":
-        return f"a list of {branch.get('minItems')}: {branch.get('description')}"
-    if kind == "object":
-        return f"a group of keys: {', '.join(branch.get('properties', {})) or 'any'}"
-    if kind == "string":
-        if "pattern" in branch:
-            return f"text of {branch['description']}"
-        least, most = branch.get("minLength", 0), branch.get("maxLength")
-        return f"text of {least} to {most} characters" if most else "text that is not empty" if least else "text"
-    return {"boolean": "true | false"}.get(kind, kind)
+    found = faults_of(error.errors(include_url=False), tree.data, schema, former=REMOVED, advice=_ADVICE)
+    return [f"{tree.origin(fault.key)}: {fault.sentence}" for fault in found]

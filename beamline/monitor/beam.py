@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import pydantic
 
 from beamline.monitor.change import FrameScatter, SampleChange
 from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, light, more_light
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import COVERED, DRIFT_STEP, CellGrid, CellView, brightest_place
 from drivers.base.frame import Frame, FrameKind
+from recon.base.setting import setting
 
 LASTS = 5  # views that a drift must last
 GROWN = 2.0  # times the reported drift, at which it is reported again
@@ -62,12 +62,8 @@ class BeamCheck(Logged):
     unit: ClassVar[str] = "fraction of the reference light"
     meaning: ClassVar[str] = "the light differs from that of the flats, or dipped against the views before"
 
-    drift: Annotated[float, pydantic.Field(ge=0, description="fraction by which the light may drift, either way")] = (
-        0.02
-    )
-    dip: Annotated[
-        float, pydantic.Field(ge=0, lt=1, description="fraction of the light whose loss at once is an alarm")
-    ] = 0.10
+    drift: float = setting(0.02, "fraction by which the light may drift, either way", ge=0)
+    dip: float = setting(0.10, "fraction of the light whose loss at once is an alarm", ge=0, lt=1)
 
     start = BeamState
 

@@ -134,7 +134,7 @@ class Logged:
 class Check(Protocol):
     """One check of the monitor: a frozen dataclass whose fields are its limits, each with a default.
 
-    The type of a field, pydantic constraints and description included, is what the configuration
+    The type of a field, with what `recon.base.setting.setting` declares of it, is what the configuration
     `monitor.<check>.<limit>` accepts (see beamline.config.monitor).
 
     Attributes:

@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import pydantic
 import scipy
 from numpy.typing import NDArray
 
@@ -22,6 +21,7 @@ from beamline.monitor.view import AIR, BRIGHT, UNLIT, CellGrid, brightest_place
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import median_deviation
 from recon.base.noise import deviation_between_neighbours
+from recon.base.setting import setting
 from recon.voxels.field_edges import LEAST
 
 LASTS = 5  # views in a row with matter at an edge
@@ -54,12 +54,8 @@ class FieldOfViewCheck(Logged):
     unit: ClassVar[str] = "share of the frame, or line integral at its edge"
     meaning: ClassVar[str] = "a part of the frame gets no light even without a sample"
 
-    unlit: Annotated[float, pydantic.Field(ge=0, lt=1, description="share of the frame that may be without light")] = (
-        0.02
-    )
-    edge: Annotated[
-        float, pydantic.Field(ge=0, description="line integral at the edges up to which the sample is inside")
-    ] = LEAST
+    unlit: float = setting(0.02, "share of the frame that may be without light", ge=0, lt=1)
+    edge: float = setting(LEAST, "line integral at the edges up to which the sample is inside", ge=0)
 
     start = FieldState
 
@@ -158,10 +154,8 @@ class MassCheck(Logged):
     unit: ClassVar[str] = "relative change"
     meaning: ClassVar[str] = "the total absorption differs from that of the first projections, several views in a row"
 
-    warn: Annotated[float, pydantic.Field(ge=0, description="relative change of the total absorption")] = 0.03
-    frames: Annotated[
-        int, pydantic.Field(ge=1, description="projections in a row beyond the limit that make a finding")
-    ] = 3
+    warn: float = setting(0.03, "relative change of the total absorption", ge=0)
+    frames: int = setting(3, "projections in a row beyond the limit that make a finding", ge=1)
 
     start = MassState
 
@@ -239,7 +233,7 @@ class PixelsCheck(Logged):
     unit: ClassVar[str] = "fraction of the pixels"
     meaning: ClassVar[str] = "many pixels of the camera are dead, or hold no number"
 
-    warn: Annotated[float, pydantic.Field(ge=0, le=1, description="fraction of the pixels that may be dead")] = 1e-3
+    warn: float = setting(1e-3, "fraction of the pixels that may be dead", ge=0, le=1)
 
     start = PixelsState
 

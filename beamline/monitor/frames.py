@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import nan
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
 from beamline.monitor.check import AGAIN, CheckResult, Flag, Level, Logged, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest, thinned
 from drivers.base.frame import Frame, FrameKind
+from recon.base.setting import setting
 
 FEW_PIXELS = 2  # fewer may be hot pixels that the darks did not show
 
@@ -37,10 +37,8 @@ class SaturationCheck(Logged):
     unit: ClassVar[str] = "fraction of the pixels"
     meaning: ClassVar[str] = "more pixels are saturated than in the darks"
 
-    warn: Annotated[float, pydantic.Field(ge=0, description="fraction of saturated pixels above which it warns")] = 1e-5
-    alarm: Annotated[
-        float, pydantic.Field(ge=0, description="fraction of saturated pixels above which it is an alarm")
-    ] = 1e-3
+    warn: float = setting(1e-5, "fraction of saturated pixels above which it warns", ge=0)
+    alarm: float = setting(1e-3, "fraction of saturated pixels above which it is an alarm", ge=0)
 
     start = SaturationState
 
@@ -129,7 +127,7 @@ class TimingCheck(Logged):
     unit: ClassVar[str] = "trigger periods"
     meaning: ClassVar[str] = "the frame came early or late (fly scans)"
 
-    warn: Annotated[float, pydantic.Field(ge=0, description="periods by which a frame may come early or late")] = 0.25
+    warn: float = setting(0.25, "periods by which a frame may come early or late", ge=0)
 
     start = TimingState
 
@@ -181,9 +179,7 @@ class DarkCheck(Logged):
     unit: ClassVar[str] = "counts of drift"
     meaning: ClassVar[str] = "a dark differs from the first one"
 
-    drift: Annotated[
-        float, pydantic.Field(ge=0, description="counts by which a dark may differ from the first one")
-    ] = 5.0
+    drift: float = setting(5.0, "counts by which a dark may differ from the first one", ge=0)
 
     start = DarkState
 
@@ -229,9 +225,7 @@ class LostCheck:
     meaning: ClassVar[str] = "the beam is gone"
     policy: ClassVar[Policy] = Policy.STOP
 
-    alarm: Annotated[
-        float, pydantic.Field(ge=0.5, le=1, description="fraction of the light without which it is lost")
-    ] = 0.5
+    alarm: float = setting(0.5, "fraction of the light without which it is lost", ge=0.5, le=1)
 
     start = LostState
 

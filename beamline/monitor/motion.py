@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar
-
-import pydantic
+from typing import ClassVar
 
 from beamline.monitor.change import SPAN, FrameScatter, SampleChange
 from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame
+from recon.base.setting import setting
 
 PAIRS = 32  # changes that follow one another, before anything is reported
 SHAKE_MEMORY = 0.02  # weight of the newest pair
@@ -125,16 +124,9 @@ class MotionCheck(Logged):
     unit: ClassVar[str] = "pixels, or steps of the stage"
     meaning: ClassVar[str] = "the sample jumped or slipped (alarm), or shakes (warn): views do not fit together"
 
-    alarm: Annotated[
-        float, pydantic.Field(ge=0, description="pixels by which the sample may shift between two views")
-    ] = 0.5
-    steps: Annotated[float, pydantic.Field(ge=0, description="steps by which the stage may turn too far at once")] = 3.0
-    shake: Annotated[
-        float,
-        pydantic.Field(
-            ge=0, description="pixels, a standard deviation, by which views may stand beside the sample's way"
-        ),
-    ] = 0.25
+    alarm: float = setting(0.5, "pixels by which the sample may shift between two views", ge=0)
+    steps: float = setting(3.0, "steps by which the stage may turn too far at once", ge=0)
+    shake: float = setting(0.25, "pixels, a standard deviation, by which views may stand beside the sample's way", ge=0)
 
     start = MotionState
 

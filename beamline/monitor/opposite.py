@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import pydantic
 import scipy
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellGrid, CellView, cell_noise
 from drivers.base.frame import Frame
+from recon.base.setting import setting
 
 EVERY = math.radians(5)  # radians between kept views
 MOST = 36  # of them: half a turn
@@ -91,15 +91,9 @@ class OppositeCheck(Logged):
         "the view from the other side, or the same view before, shows the sample elsewhere or changed"
     )
 
-    warn: Annotated[float, pydantic.Field(ge=0, description="pixels by which the sample may have moved or changed")] = (
-        0.5
-    )
-    changed: Annotated[
-        float, pydantic.Field(ge=0, description="pixels, as a shift of all, by which parts may differ")
-    ] = 1.0
-    axis: Annotated[
-        float, pydantic.Field(ge=0, description="pixels between the axis and its stated place that are said")
-    ] = 1.0
+    warn: float = setting(0.5, "pixels by which the sample may have moved or changed", ge=0)
+    changed: float = setting(1.0, "pixels, as a shift of all, by which parts may differ", ge=0)
+    axis: float = setting(1.0, "pixels between the axis and its stated place that are said", ge=0)
 
     start = OppositeState
 

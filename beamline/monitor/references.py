@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-import pydantic
 
 from beamline.core.flag import Finding, Severity
 from beamline.core.text import spans
@@ -38,6 +36,7 @@ from beamline.monitor.sample_in_flats import (
 )
 from drivers.base.frame import FrameKind
 from recon.base.arrays import MEDIAN
+from recon.base.setting import setting
 
 READOUT = 3.0  # counts: noise of a pixel that readout alone leaves in a clean dark
 FEW = 20.0  # noises of the darks: flats with less light have hardly more noise, so that their variance tells nothing
@@ -64,22 +63,12 @@ class ReferenceLimits:
         variance. An offset has only the former, readout noise only the latter. A fifth of both is neither.
     """
 
-    saturated: Annotated[
-        float, pydantic.Field(ge=0, lt=1, description="fraction of the pixels of a flat at their end")
-    ] = 1e-3
-    light_over_noise: Annotated[
-        float, pydantic.Field(ge=0, description="light of a flat over the noise of a dark's pixel")
-    ] = 3.0
-    light_gone: Annotated[
-        float, pydantic.Field(gt=0, lt=1, description="light that is gone, of the brightest flats")
-    ] = 0.5
-    uneven: Annotated[
-        float, pydantic.Field(gt=0, description="relative change of the light between flats of a group")
-    ] = 0.1
-    unlit: Annotated[float, pydantic.Field(gt=0, le=1, description="fraction of the frame that flats leave dark")] = 0.5
-    light_in_darks: Annotated[
-        float, pydantic.Field(gt=0, lt=1, description="level and variance of darks over those of flats")
-    ] = 0.2
+    saturated: float = setting(1e-3, "fraction of the pixels of a flat at their end", ge=0, lt=1)
+    light_over_noise: float = setting(3.0, "light of a flat over the noise of a dark's pixel", ge=0)
+    light_gone: float = setting(0.5, "light that is gone, of the brightest flats", gt=0, lt=1)
+    uneven: float = setting(0.1, "relative change of the light between flats of a group", gt=0)
+    unlit: float = setting(0.5, "fraction of the frame that flats leave dark", gt=0, le=1)
+    light_in_darks: float = setting(0.2, "level and variance of darks over those of flats", gt=0, lt=1)
 
 
 DARK, FLAT = FrameKind.DARK, FrameKind.FLAT

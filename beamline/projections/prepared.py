@@ -124,8 +124,11 @@ class PreparedProjections:
     @property
     def ordinary(self) -> PreparedProjections:
         """The same views without wide ones, which show the sample more than half a field beside its usual place."""
-        ordinary = self.geometry.ordinary
-        return self if ordinary.all() else self.of_views(np.flatnonzero(ordinary))
+        return self.wanted(self.geometry.ordinary)
+
+    def wanted(self, views: NDArray[np.bool_]) -> PreparedProjections:
+        """The same views without those that are not wanted, [view]."""
+        return self if views.all() else self.of_views(np.flatnonzero(views))
 
     def of_views(self, views: I64) -> PreparedProjections:
         """Some of the views used, by number and in this order; held-out views are unchanged."""

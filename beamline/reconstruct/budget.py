@@ -8,7 +8,7 @@ from typing import Any, cast
 from beamline.core.sinks import Warn
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, Method, candidates_of
+from recon.base.method import Clock, Method
 from recon.base.volume import Grid
 from recon.forecast import Timing
 
@@ -32,7 +32,7 @@ def in_budget(
     end = now() + budget
     timing = Timing(geometry, grid, now, _TIMED_VOXELS)
     kept, seconds, refused = list[Method](), dict[str, float](), list[str]()
-    for each in candidates_of(method):
+    for each in method.alternatives:
         try:
             seconds[each.name] = timing.of(each).most
             kept.append(each)

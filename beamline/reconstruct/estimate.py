@@ -19,7 +19,7 @@ from beamline.reconstruct.truth import fit_truth
 from beamline.storage.readers.base import ScanSource
 from recon.assess.time_model import duration_text
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, Method, candidates_of, volumes_of
+from recon.base.method import Clock, Method
 from recon.base.slabs import Slab, slabs_of
 from recon.base.volume import Grid
 from recon.forecast import forecast
@@ -91,7 +91,7 @@ def estimate(options: ReconOptions, now: Clock = time.perf_counter) -> Estimate:
         plan = planned(source, options, needs)
     method, geometry = plan.needs.method, plan.needs.geometry
     options.target.require_room(plan.output, plan.scratch)
-    shape, several = Grid.matching(geometry).shape, volumes_of(method)
+    shape, several = Grid.matching(geometry).shape, method.volumes
     missing = plan.missing if plan.slabs else slabs_of(shape[0], shape[0], 0)
     span = _seconds(options, method, geometry, missing, now)
     return Estimate(
@@ -123,7 +123,7 @@ def _seconds(
         return 0.0, 0.0
     grid = Grid.matching(geometry)
     try:
-        for candidate in candidates_of(method):
+        for candidate in method.alternatives:
             warm_up(candidate, geometry)
         expected = forecast(method, geometry, grid, now)
     except ValueError as error:  # as the method itself refuses the views

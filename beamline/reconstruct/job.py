@@ -35,13 +35,12 @@ from recon.base.method import (
     Progress,
     Reconstruction,
     RunControl,
-    candidates_of,
-    setting,
 )
+from recon.base.method_kinds import Series
 from recon.base.slabs import Slab
 from recon.base.volume import Grid
 from recon.error_bars import method_on_voxels
-from recon.splatting.fit_method import FitMethod
+from recon.splatting.fit_method import Fit
 from recon.splatting.time_limit import FinalFit
 from recon.voxels.projector import measured_share
 from recon.warm_up import warm_up
@@ -138,7 +137,7 @@ class Job:
     def grid(self) -> Grid:
         """Grid of the volume; for a direct method, only that of the requested region."""
         grid = Grid.matching(self.prepared.geometry)
-        return self.region.grid_of(grid) if self.region is not None and self.options.method.traits.direct else grid
+        return self.region.grid_of(grid) if self.region is not None and self.options.method.makes_boxes else grid
 
     @property
     def method(self) -> Method:
@@ -168,7 +167,7 @@ def compile_kernels(options: ReconOptions, geometry: Geometry, sink: Sink, clock
     The time must count neither in the run nor in the estimated time left.
     """
     method, compiled = options.method, compilation_events(sink, clock)
-    methods = candidates_of(method) if options.budget is not None else (method,)
+    methods = method.alternatives if options.budget is not None else (method,)
     for candidate in methods if options.cluster is None else ():
         with refused(options, f" by {candidate.name}"):
             warm_up(candidate, geometry, device=options.device, on_kernel=compiled)
@@ -213,7 +212,7 @@ def _volume_of(job: Job, decided: Decisions) -> tuple[Reconstruction, PreparedPr
         made = _at_once(job, decided)
         return replace(made, outside=None), without_outside(prepared, made)
     made = _by_slabs(job, decided)
-    if job.options.method.traits.direct and prepared.view_weights is not None:
+    if not job.options.method.weighs and prepared.view_weights is not None:
         # For the record: FBP takes all rays alike, and so do its figures.
         made = replace(made, settings={**made.settings, "view_weights": prepared.view_weights})
         prepared = replace(prepared, view_weights=None)
@@ -247,7 +246,7 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
     if deviation is None:
         job.channels.warn(f"There are no error bars: {why}. The volume is complete.")
         return made
-    factors = method_on_voxels(method, decided.made).traits.error_bars
+    factors = method_on_voxels(method, decided.made).error_bars
     assert factors is not None
     settings = dict(zip(("error_bars_spread", "error_bars_gradient"), factors, strict=True))
     return replace(made, deviation=deviation, settings={**made.settings, **settings})
@@ -258,7 +257,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
     options, prepared, checkpoints, method = job.options, job.prepared, job.options.checkpoints, job.method
     origin, resume, steps = {}, None, 0
     if checkpoints.wanted:
-        assert isinstance(method, FitMethod)  # other methods were refused
+        assert isinstance(method, Fit)  # other methods were refused
         settings, others = method.provenance
         origin, steps = origin_of(prepared, settings, {"seed": options.seed, **others}), method.planned_steps or 0
         resume = checkpoints.begin(origin, steps, job.channels.warn)
@@ -270,7 +269,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
 
     control = RunControl(
         job.stop,
-        job.listener(setting(method, "seconds")),
+        job.listener(method.time_limit),
         None if checkpoints.path is None else keep,
         resume=resume,
         now=job.channels.clock.now,
@@ -279,7 +278,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
     result = runner_of(options)(method, prepared, job.grid, control)
     if result.checkpoint is not None:
         keep(result.checkpoint)
-    if method.traits.held_out:
+    if "held_out" in method.takes:
         result = replace(result, settings={k: v for k, v in result.settings.items() if k != "held_out"})
     resumed_from = "" if checkpoints.resume is None else str(checkpoints.resume)
     return _ended(result, Ending(_is_early(job, result), resumed_from, lost), _of_preset(job, result))
@@ -288,7 +287,7 @@ def _at_once(job: Job, decided: Decisions) -> Reconstruction:
 def _of_preset(job: Job, result: Reconstruction) -> str:
     """Steps and Gaussians that a preset chose; without one, a warning if a fit could not have the number asked for."""
     method, started_from = job.method, result.started_from
-    if not isinstance(method, FitMethod):
+    if not isinstance(method, Fit):
         return ""
     if job.options.quality is not None:
         return f"{job.options.quality}: {method.steps} steps from {started_from} Gaussians"
@@ -304,7 +303,7 @@ def _is_early(job: Job, result: Reconstruction) -> bool:
     """Whether a stop ended the method before its last step."""
     method = job.method
     # The sweeps of a finish, and the factors of several volumes, follow the last step, and can be stopped as well.
-    if method.traits.in_time or (isinstance(method, FitMethod) and method.finish_sweeps > 0):
+    if isinstance(method, Series) or (isinstance(method, Fit) and method.finish_sweeps > 0):
         return job.stop.stopped
     return job.stop.cut(*((result.history[-1].step, result.history[-1].steps) if result.history else (0, 0)))
 

@@ -18,8 +18,7 @@ from beamline.projections.views import stated_geometry
 from beamline.reconstruct.options import ReconOptions
 from beamline.storage.readers.base import ScanSource
 from recon.base.geometry import Geometry
-from recon.base.method import Method, candidates_of, volumes_of
-from recon.base.method import for_part as method_for_part
+from recon.base.method import Method
 from recon.base.registry import add_on_missing, plugins
 from recon.base.volume import Grid
 from recon.error_bars import HALO, error_bars_memory
@@ -71,7 +70,7 @@ class ReconMemory:
     @property
     def volume(self) -> int:
         """Memory of the result, which may be several volumes."""
-        return 4 * volumes_of(self.method) * math.prod(Grid.matching(self.geometry).shape)
+        return 4 * self.method.volumes * math.prod(Grid.matching(self.geometry).shape)
 
     @property
     def at_once(self) -> int:
@@ -91,11 +90,11 @@ class ReconMemory:
 
     def slab(self, height: int) -> int:
         """Memory of a slab of `height` slices, with its views and weights; figures of merit need less."""
-        halo = self.method.traits.halo
+        halo = self.method.halo
         seen = min(height + 2 * (max(halo, HALO) if self.bars else halo), self.rows)
         part = self.geometry.rows(0, seen)
         rays = (1 + self.weighted) * 4 * part.n_views * math.prod(part.detector_shape)
-        work = self._work(for_part(self.method, seen, self.rows, self.rows), part, self._grid(seen))
+        work = self._work(self.method.for_part(seen / self.rows, seen / self.rows), part, self._grid(seen))
         return self.weights + rays + work
 
     def _work(self, method: Method, geometry: Geometry, grid: Grid) -> int:
@@ -103,13 +102,13 @@ class ReconMemory:
         work = method.memory(geometry, grid, self.weighted)
         if not self.bars:
             return work
-        bars = max(error_bars_memory(candidate, geometry, grid) for candidate in candidates_of(method))
+        bars = max(error_bars_memory(candidate, geometry, grid) for candidate in method.alternatives)
         return max(work, 4 * math.prod(grid.shape) + bars)
 
     @property
     def figures(self) -> int:
         """Memory of the figures of merit for a volume on disk, without that of the program; FBP needs less."""
-        most = judge_memory(self.geometry, fitted=not self.method.traits.direct)
+        most = judge_memory(self.geometry, fitted=self.method.fitted)
         return most if most > _ASIDE else 0
 
     @property
@@ -142,13 +141,6 @@ class ReconMemory:
         return grid.as_tall_as_rays(self.geometry) if self.taller else grid
 
 
-def for_part(method: Method, slices: int, of: int, in_all: int) -> Method:
-    """The method for `slices` slices `of` a volume; `in_all` is the number of slices of all slabs, overlaps counted
-    twice.
-    """
-    return method_for_part(method, slices / of, slices / in_all)
-
-
 def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
     """Memory for reconstructing the chosen views of a scan, before any frame is read.
 
@@ -165,7 +157,7 @@ def recon_memory_of(source: ScanSource, options: ReconOptions) -> ReconMemory:
         options.method_for(geometry),
         geometry,
         geometry.n_views * math.prod(geometry.detector_shape) * pixel,
-        not method.traits.direct,
+        method.weighs,
         StepMemory.of_all(stated.values()),
         max(stated, key=lambda name: stated[name].alone),
         options.uncertainty,
@@ -182,11 +174,11 @@ def memory_of(options: ReconOptions) -> int:
 
 def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, memory: int) -> None:
     """Raise ConfigError for methods and options that need everything in memory."""
-    if options.method.traits.in_time:
+    if options.method.volumes > 1:
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
         raise ConfigError(
-            f"{count(volumes_of(options.method), 'volume')} in time of {Grid.matching(needs.geometry).shape} voxels "
+            f"{count(options.method.volumes, 'volume')} in time of {Grid.matching(needs.geometry).shape} voxels "
             f"take {size(needs.at_once)} of memory, {size(memory)} may be used. Volumes in time are not made in slabs: "
             f"give {rows}--bin. Nothing was written."
         )
@@ -195,7 +187,7 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
         **{f"{step.asked_by} with roll or tilt": step.may_lean for step in geometry_steps(options.selection)},
         "--poses with roll, tilt or vectors": poses is not None and poses.leans,
         "--checkpoint and --resume": options.checkpoints.wanted,
-        "--early-stop": options.stops_early,
+        "--early-stop": options.method.stops_early,
     }
     for option, given in whole.items():
         if given:

@@ -20,8 +20,8 @@ from beamline.storage.writer_lock import PATIENCE
 from recon.base.choices import Quality
 from recon.base.declared_types import check_settings
 from recon.base.geometry import Geometry
-from recon.base.method import Method, PresetMethod, setting
-from recon.splatting.fit_method import FitMethod
+from recon.base.method import Method
+from recon.splatting.fit_method import Fit
 from recon.splatting.initialise import default_count
 from recon.splatting.r2 import R2
 from recon.voxels.fbp import Filter
@@ -156,7 +156,7 @@ class ReconOptions:
         """Bytes on disk for the result, and for temporary files, of a volume of `volume` bytes."""
         if not in_slabs:
             return volume * self.target.written * (1 + self.uncertainty), 0
-        compared = self.target.report is not None and not self.method.traits.direct
+        compared = self.target.report is not None and self.method.fitted
         slabs = self.partial is None  # else they are there
         bars = self.uncertainty
         if not self.target.written:
@@ -175,7 +175,7 @@ class ReconOptions:
             return self
         if isinstance(region, AroundSample):
             region = box_around_sample(source, self.selection)
-        selection = selection_around(source, self.selection, region, self.method.traits.halo)
+        selection = selection_around(source, self.selection, region, self.method.halo)
         return replace(self, selection=selection, region=region)
 
     @property
@@ -185,22 +185,17 @@ class ReconOptions:
 
     def method_for(self, geometry: Geometry) -> Method:
         """The method for these views, with the steps and Gaussians of the preset, if there is one."""
-        if self.quality is None or not isinstance(self.method, PresetMethod):
+        if self.quality is None:
             return self.method
         return self.method.with_quality(self.quality, default_count(geometry, geometry.sample_pitch))
 
     @property
-    def stops_early(self) -> bool:
-        """Whether held-out views may end the method early."""
-        return bool(setting(self.method, "early_stop", False))
-
-    @property
-    def streaming(self) -> FitMethod:
+    def streaming(self) -> Fit:
         """The method for a scan that is followed while it runs; `streams` must hold."""
-        assert isinstance(self.method, FitMethod)
+        assert isinstance(self.method, Fit)
         return self.method
 
     @property
     def streams(self) -> bool:
         """Whether the volume of the method grows with the views; another one waits for the end of the scan."""
-        return isinstance(self.method, FitMethod)
+        return isinstance(self.method, Fit)

@@ -24,6 +24,7 @@ from beamline.reconstruct.job import (
     compilation_events,
     compile_kernels,
     corrections_done,
+    refused,
     volume_of,
     with_error_bars,
 )
@@ -42,7 +43,6 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writer_lock import WriterWatch
 from drivers.base.clock import Clock
 from recon.base.decisions import Decisions, Stop
-from recon.base.method import setting
 from recon.base.volume import Grid
 from recon.splatting.r2 import R2
 from recon.warm_up import warm_up
@@ -186,13 +186,13 @@ def finished_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
         warn(few)
     region = None if box is None else locate(box, options.selection, prepared.geometry)
     # A direct method and a slab have no volume so far: a signal interrupts them.
-    stopping = never_stopped if options.method.traits.direct or plan.slabs else channels.stop_scope
+    stopping = channels.stop_scope if options.method.fitted and not plan.slabs else never_stopped
     with keeping(options.partial_path) if plan.slabs else nullcontext():
         phases.enter("compiling kernels")
         compile_kernels(options, prepared.geometry, sink, clock)
         phases.enter("reconstruction")
         before_report = Stop()
-        if (limit := setting(options.method, "seconds")) is not None:
+        if (limit := options.method.time_limit) is not None:
             started = channels.started, channels.worked
             method, before_report = fit_within(options.method, limit, prepared, options.target, started, clock, warn)
             options = replace(options, method=method)
@@ -216,14 +216,15 @@ def _for_method(
     Raises:
         ConfigError, DataError: the views do not suffice, or the disk does not.
     """
-    prepared = prepared.ordinary if options.method.traits.direct else prepared
+    with refused(options, f" by {options.method.name}"):
+        prepared = prepared.wanted(options.method.views_wanted(prepared.geometry))
     if options.uncertainty:
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not plan.slabs:
         channels.warn(
             "The volume fits into memory and is reconstructed without --cluster; a smaller --memory would make slabs."
         )
-    if options.stops_early and prepared.held_out is None:
+    if options.method.stops_early and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
         n = prepared.projections.view_ids.size
         message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"

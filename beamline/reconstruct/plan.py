@@ -46,12 +46,12 @@ from beamline.storage.writers.recon_file import SUFFIXES
 from drivers.base.clock import Clock
 from recon.base.arrays import F64, I64
 from recon.base.geometry import Geometry
-from recon.base.method import SampleRadius, volumes_of
+from recon.base.method import SampleRadius
 from recon.base.slabs import Slab, slabs_of
 from recon.base.views import parse_views
 from recon.base.volume import Grid
 from recon.splatting.backend import backend_for
-from recon.voxels.beyond_field import knows_outside, sample_radius
+from recon.voxels.beyond_field import sample_radius
 from recon.voxels.field_edges import taller_than_field
 
 _BATCH = 0.25  # of the memory: views during correction
@@ -97,14 +97,14 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
         return _plan(options, needs, allowed)
     if options.partial is None:
         options.target.refuse_partial()
-    if not options.method.traits.in_time and options.selection.of(source).cone is not None:
+    if options.method.volumes == 1 and options.selection.of(source).cone is not None:
         raise DataError(
             f"{source.path}: {options.method.name} would take {size(at_once)}, {size(allowed)} of memory may be used, "
             "and a cone is not made in slabs. Give more --memory, or --bin 2, or fewer --rows."
         )
     refuse_whole(source, options, needs, allowed)
     turned = options.selection.step(TiltAndLens).of(source, options.selection.of(source)) is not None
-    needs = replace(needs, weighted=turned and not options.method.traits.direct)  # other weights are not known yet
+    needs = replace(needs, weighted=turned and options.method.weighs)  # other weights are not known yet
     return _in_slabs(source, options, needs, allowed)
 
 
@@ -118,14 +118,13 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
         DataError: the volume does not fit, as its axis was found near an edge.
     """
     geometry = prepared.geometry
-    direct, shares = options.method.traits.direct, prepared.shares
+    method, shares = options.method, prepared.shares
     differ = not plan.slabs or prepared.ray_factors() is not None or prepared.shares_of is not None
-    weighted = shares is not None if direct else differ
-    sample, whole = prepared.sample_radius, knows_outside(options.method.traits)
+    weighted, sample = differ if method.weighs else shares is not None, prepared.sample_radius
     needs = ReconMemory(
         options.method_for(geometry), geometry, 0, weighted, bars=options.uncertainty,
         radius=sample.radius if isinstance(sample, SampleRadius) else None,
-        taller=whole and taller_than_field(prepared.projections.data, geometry),
+        taller=method.knows_outside and taller_than_field(prepared.projections.data, geometry),
         weights=0 if shares is None else shares.nbytes * (1 + (not plan.slabs)),  # of parts of views, and of all rays
     )  # fmt: skip
     more = "the sample goes on beyond the field" if needs.radius is not None or needs.taller else ""
@@ -136,7 +135,7 @@ def of_views(source: ScanSource, options: ReconOptions, plan: ReconPlan, prepare
             f"{size(plan.allowed)} may be used. A cone is not made in slabs. Give more --memory, or --bin 2, or fewer "
             "--rows. Nothing was written."
         )
-    if plan.slabs or (more and not options.method.traits.in_time and needs.at_once > plan.allowed):
+    if plan.slabs or (more and method.volumes == 1 and needs.at_once > plan.allowed):
         return _in_slabs(source, options, needs, plan.allowed)
     if not geometry.is_cone and prepared.axis is not None and needs.at_once > plan.allowed:
         raise DataError(
@@ -151,7 +150,7 @@ def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, 
     """Raise DataError or ConfigError for the geometry of all views, once the axis is known."""
     _refuse_views(source, options, geometry)
     _refuse_region(options, geometry)
-    if options.method.traits.in_time:
+    if options.method.volumes > 1:
         needs = ReconMemory(options.method, geometry, 0, True)
         if needs.at_once > plan.allowed:
             refuse_whole(source, options, needs, plan.allowed)
@@ -164,7 +163,7 @@ def refuse_geometry(source: ScanSource, options: ReconOptions, plan: ReconPlan, 
 
 def _refuse_views(source: ScanSource, options: ReconOptions, geometry: Geometry) -> None:
     """Raise DataError and ConfigError for views that are too few."""
-    volumes, least = volumes_of(options.method), options.method.traits.least_views
+    volumes, least = options.method.volumes, options.method.least_views
     if volumes * least > geometry.n_views:
         raise DataError(
             f"{source.path} cannot be reconstructed by {options.method.name}: {volumes} volumes of {geometry.n_views} "
@@ -185,7 +184,7 @@ def _in_slabs(source: ScanSource, options: ReconOptions, needs: ReconMemory, all
     refuse_smallest(source, needs, allowed, options.selection.binning)
     slices, partial = Grid.matching(needs.geometry).shape[0], options.partial
     if partial is None:
-        slabs = slabs_of(slices, needs.height(allowed), needs.method.traits.halo)
+        slabs = slabs_of(slices, needs.height(allowed), needs.method.halo)
         return _plan(options, needs, allowed, slabs, slabs)
     slabs, missing = slabs_of_partial(partial)
     if slabs[-1].own.stop != slices:
@@ -242,9 +241,9 @@ def prepare_within(
     prepared = prepare_projections(
         source, selection, warn, buffer, lambda geometry: refuse_geometry(source, options, plan, geometry), phases
     )
-    if options.method.traits.in_time:
+    if "times" in options.method.takes:
         prepared = replace(prepared, times=times_of(source, prepared.projections.view_ids, warn))
-    if knows_outside(options.method.traits):
+    if options.method.knows_outside:
         radius = sample_radius(prepared.views, prepared.sample_radius) or 0.0  # it is not searched again
         prepared = replace(prepared, sample_radius=radius)
     return prepared, of_views(source, options, plan, prepared)
@@ -295,7 +294,7 @@ def refuse_before_reading(options: ReconOptions) -> NDArray[np.float32] | None:
 
 def _refuse_several_volumes(options: ReconOptions) -> None:
     """Raises ConfigError where options of one volume stand beside a method that makes several."""
-    if options.method.traits.in_time:
+    if options.method.volumes > 1:
         target = options.target
         if target.written and target.output.suffix.lower() not in SUFFIXES:
             raise ConfigError(

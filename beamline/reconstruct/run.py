@@ -26,13 +26,13 @@ from recon.assess.time_model import duration_text
 from recon.base.arrays import F32
 from recon.base.decisions import Stop
 from recon.base.geometry import Geometry
-from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl, candidates_of
+from recon.base.method import DataUse, Method, ReconProblem, Reconstruction, RunControl
 from recon.base.slabs import Slab, part_of, slabs_of
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.error_bars import HALO, LEAST_VIEWS, ErrorBars, error_bars
-from recon.methods import by_name, with_settings, with_trait
-from recon.splatting.fit_method import FitMethod
+from recon.methods import by_name, names_where, with_settings
+from recon.splatting.fit_method import Fit
 
 
 def run_on(
@@ -55,19 +55,17 @@ def run_on(
 
 def views_for(method: Method, prepared: PreparedProjections) -> tuple[F32, Geometry, DataUse]:
     """Line integrals [view, row, col], geometry and use of the views in the form that the method expects."""
-    prepared = prepared.ordinary if method.traits.direct else prepared
+    prepared = prepared.wanted(method.views_wanted(prepared.geometry))
     data, geometry, held_out = prepared.projections.data, prepared.geometry, list[int]()
-    if method.traits.held_out:
+    if "held_out" in method.takes:
         data, geometry, held_out = with_held_out(data, geometry, prepared.held_out)
-    # Rays that weigh nothing were filled on disk, as a direct method does it.
-    filled = method.traits.direct and prepared.on_disk
-    use = DataUse(
-        None if filled else prepared.ray_weights(len(held_out)),
-        held_out,
-        prepared.times if method.traits.in_time else None,
-        prepared.sample_radius,
-    )
-    return data, geometry, use
+    weights, times = _weights(method, prepared, len(held_out)), prepared.times if "times" in method.takes else None
+    return data, geometry, DataUse(weights, held_out, times, prepared.sample_radius)
+
+
+def _weights(method: Method, prepared: PreparedProjections, held_out: int = 0) -> F32 | None:
+    """Weights of the rays for a method; on disk, rays that weigh nothing were filled, as a direct method does it."""
+    return prepared.ray_weights(held_out) if method.weighs or not prepared.on_disk else None
 
 
 def without_outside(prepared: PreparedProjections, made: Reconstruction) -> PreparedProjections:
@@ -139,10 +137,9 @@ Made = Mapping[str, Sequence[Any]]
 
 def refuse_impossible(options: ReconOptions) -> None:
     """Raise ConfigError before any work if error bars cannot be computed or written."""
-    methods = candidates_of(options.method)
-    if not all(method.traits.error_bars for method in methods):
+    if not all(method.error_bars for method in options.method.alternatives):
         raise ConfigError(
-            f"--uncertainty is calibrated for {', '.join(with_trait('error_bars'))}, and not for "
+            f"--uncertainty is calibrated for {', '.join(names_where(lambda each: each.error_bars))}, and not for "
             f"{options.method.name}: leave it out, or choose another method."
         )
     if options.target.written and options.target.output.suffix.lower() not in SUFFIXES:
@@ -159,7 +156,7 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
             f"--uncertainty splits the views into two halves: at least {LEAST_VIEWS} views are needed, got "
             f"{geometry.n_views}. Leave it out, or take more views."
         )
-    if isinstance(method, FitMethod) and method.finish_sweeps == 0:
+    if isinstance(method, Fit) and method.finish_sweeps == 0:
         raise ConfigError(
             f"--uncertainty refits on voxels, and {method.name} with --finish 0 has no steps on voxels. Leave one of "
             "them out."
@@ -168,7 +165,7 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
 
 def candidate_named(method: Method, name: str) -> Method:
     """The candidate of this name among which the method chose; the method itself if it chose among none."""
-    return {candidate.name: candidate for candidate in candidates_of(method)}.get(name, method)
+    return {candidate.name: candidate for candidate in method.alternatives}.get(name, method)
 
 
 def deviation_of(
@@ -202,7 +199,7 @@ def deviation_by_slabs(
     The slab with most matter comes first, and the others follow its decisions.
     """
     grid = Grid.matching(prepared.geometry)
-    parts = slabs_of(grid.shape[0], slabs[0].own.stop, max(method.traits.halo, HALO))
+    parts = slabs_of(grid.shape[0], slabs[0].own.stop, max(method.halo, HALO))
     out = scratch_array(Path(options.target.output).parent, grid.shape)
     for done, n in enumerate(busiest_first(prepared, grid, parts), 1):
         slab = parts[n]
@@ -226,8 +223,6 @@ def _bars(
     method: Method, prepared: PreparedProjections, options: ReconOptions, volume: Volume, decided: Made,
     control: RunControl,
 ) -> ErrorBars | None:  # fmt: skip
-    # Rays that weigh nothing were filled on disk, as a direct method does it.
-    weights = None if method.traits.direct and prepared.on_disk else prepared.ray_weights()
-    views = Views(prepared.projections.data, prepared.geometry, weights)
+    views = Views(prepared.projections.data, prepared.geometry, _weights(method, prepared))
     problem = ReconProblem(views, volume.grid, seed=options.seed, device=options.device)
     return error_bars(method, problem, volume, decided, replace(control, decide=None))

@@ -19,7 +19,6 @@ from beamline.core.installed import version
 from beamline.core.sinks import Warn
 from beamline.projections.prepared import PreparedProjections
 from beamline.reconstruct.checkpoints import origin_of, refuse_other
-from beamline.reconstruct.memory import for_part
 from beamline.reconstruct.options import ReconOptions
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writers.partial_volume import PartialVolume, create_partial, open_partial
@@ -168,11 +167,11 @@ class _SlabJob:
             return None, ""
         in_all = sum(each.slices.stop - each.slices.start for each in self.slabs)
         try:
-            own = for_part(method, slab.slices.stop - slab.slices.start, slices, in_all)
-            return by(own, part, box, control), ""
+            height = slab.slices.stop - slab.slices.start
+            return by(method.for_part(height / slices, height / in_all), part, box, control), ""
         except DataError as error:
             # A fit needs matter to place Gaussians in; a slab of air has none, and voxels need none.
-            if first or not method.traits.needs_matter:
+            if first or not method.needs_matter:
                 raise
             remark = f"Slices {slab.own.start} to {slab.own.stop - 1} were reconstructed by fista-tv instead: {error}"
             return by(FistaTv(), part, box, control), remark
@@ -222,7 +221,7 @@ def keeping(path: Path) -> Iterator[None]:
 def _made_from(prepared: PreparedProjections, options: ReconOptions) -> dict[str, Value]:
     """All that determines the slabs."""
     weights = hashlib.sha256()
-    if not options.method.traits.direct:
+    if options.method.weighs:
         rows = prepared.geometry.detector_shape[0]
         for first in range(0, rows, _WEIGHED):
             end = min(first + _WEIGHED, rows)
@@ -263,7 +262,7 @@ def _kept(first: Reconstruction, decide: Decisions) -> dict[str, Any]:
 def _finished(partial: PartialVolume, grid: Grid, options: ReconOptions, seconds: float) -> Reconstruction:
     """The result, when all slabs are there."""
     kept = partial.kept
-    settings = {**kept["settings"], "slabs": len(partial.slabs), "slab_halo": options.method.traits.halo}
+    settings = {**kept["settings"], "slabs": len(partial.slabs), "slab_halo": options.method.halo}
     history = tuple(Progress(*values) for values in kept["history"])
     return Reconstruction(
         Volume(partial.volume, grid), settings, history, method=kept["method"], seconds=seconds, chosen=kept["chosen"],

@@ -75,7 +75,7 @@ def check_volume(
         figures = {"residual": made.series.residual, "seconds": made.seconds}
         return CheckedVolume(Judgement(figures), volumes, {made.method: figures}, warnings)
     tell(_sample_radius(made, prepared))
-    aspects, fitted = _aspects(made, prepared, context), not by_name(made.method).traits.direct
+    aspects, fitted = _aspects(made, prepared, context), by_name(made.method).fitted
     time = TimeLeft(clock.now, lambda seconds: not made.ending.early and context.leaves(seconds))
     progress = context.phases.progress
     judgement = judge(
@@ -116,7 +116,7 @@ def _aspects(made: Reconstruction, prepared: PreparedProjections, context: Repor
     That is, more than a region, or than a field that does not hold all of the sample, where what lies beside it was not
     taken off. A direct volume leaves the blur of its filter in the views.
     """
-    geometry, fitted = prepared.geometry, not by_name(made.method).traits.direct
+    geometry, fitted = prepared.geometry, by_name(made.method).fitted
     if context.region is not None and made.volume.grid.shape != Grid.matching(geometry).shape:
         show_more = True
     elif fitted:
@@ -233,7 +233,7 @@ def _beside_each_other(
     The reference is the truth, else FBP of the views, else none. Air, if the views show any, is relative to the noise
     of FBP there.
     """
-    direct_one = made.volume if by_name(made.method).traits.direct else None
+    direct_one = None if by_name(made.method).fitted else made.volume
     reference = truth or volumes.get(BASELINE) or direct_one
     figures: dict[str, dict[str, float]] = {name: {} for name in volumes}
     if reference is not None:

@@ -10,7 +10,7 @@ from enum import StrEnum
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceTimeout
 from drivers.epics.channel import ProcessVariable, PvValue, open_channel, refuse_invalid, url_problem
-from drivers.keys import CheckedSettings, key
+from recon.base.setting import CheckedSettings, setting
 
 POLL = 0.05  # s between looks at a shutter that moves
 NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
@@ -54,16 +54,16 @@ class _PvDevice:
 class ShutterPvs(CheckedSettings):
     """The process variables of a shutter, each as pva://NAME or ca://NAME; times in s."""
 
-    open_pv: str = key(problem=url_problem)
-    status_pv: str = key(
+    open_pv: str = setting(problem=url_problem)
+    status_pv: str = setting(
         doc="Where the blade itself is read; open_pv where there is nothing better.", problem=url_problem
     )
-    close_pv: str | None = key(None, "null: open_pv, which then takes both values.", problem=url_problem)
-    open_value: float | str = key(1.0, "Written to open_pv to open it: a number, a text or a label.")
-    close_value: float | str = key(0.0)
-    status_open: float | str = key(1.0, "Its value or label while the shutter is open; anything else is closed.")
-    timeout: float = key(2.0, "For an answer of the IOC.", unit="s", gt=0, le=1e6)
-    travel: float = key(10.0, "The longest that the status may take to follow.", unit="s", gt=0, le=1e6)
+    close_pv: str | None = setting(None, "null: open_pv, which then takes both values.", problem=url_problem)
+    open_value: float | str = setting(1.0, "Written to open_pv to open it: a number, a text or a label.")
+    close_value: float | str = setting(0.0)
+    status_open: float | str = setting(1.0, "Its value or label while the shutter is open; anything else is closed.")
+    timeout: float = setting(2.0, "For an answer of the IOC.", unit="s", gt=0, le=1e6)
+    travel: float = setting(10.0, "The longest that the status may take to follow.", unit="s", gt=0, le=1e6)
 
 
 class PvShutter(_PvDevice):
@@ -121,13 +121,13 @@ class PvShutter(_PvDevice):
 class FilterPvs(CheckedSettings):
     """The process variables of a filter, as pva://NAME or ca://NAME; times in s."""
 
-    pv: str = key(doc="Takes the value of a place: a number, a text or a label.", problem=url_problem)
-    status_pv: str | None = key(
+    pv: str = setting(doc="Takes the value of a place: a number, a text or a label.", problem=url_problem)
+    status_pv: str | None = setting(
         None, "Where the filter itself is read, with the same values; null: pv.", problem=url_problem
     )
-    places: Mapping[str, float | str] = key(doc="Name: value.", min_length=1)
-    timeout: float = key(2.0, "For an answer of the IOC.", unit="s", gt=0, le=1e6)
-    travel: float = key(30.0, "The longest that the status may take to follow.", unit="s", gt=0, le=1e6)
+    places: Mapping[str, float | str] = setting(doc="Name: value.", min_length=1)
+    timeout: float = setting(2.0, "For an answer of the IOC.", unit="s", gt=0, le=1e6)
+    travel: float = setting(30.0, "The longest that the status may take to follow.", unit="s", gt=0, le=1e6)
 
 
 class PvFilter(_PvDevice):
@@ -186,18 +186,18 @@ class EnergyUnit(StrEnum):
 class MonochromatorPvs(CheckedSettings):
     """The process variables of a monochromator, as pva://NAME or ca://NAME; times in s, `tolerance` in eV."""
 
-    pv: str = key(doc="Takes the energy; a motor record's VAL, for instance.", problem=url_problem)
-    status_pv: str = key(doc="Where the energy itself is read.", problem=url_problem)
-    stop_pv: str | None = key(None, "Takes a 1 that stops it; null: it cannot be stopped.", problem=url_problem)
-    unit: EnergyUnit = key(EnergyUnit.KEV, "Of pv and status_pv.")
-    tolerance: float = key(
+    pv: str = setting(doc="Takes the energy; a motor record's VAL, for instance.", problem=url_problem)
+    status_pv: str = setting(doc="Where the energy itself is read.", problem=url_problem)
+    stop_pv: str | None = setting(None, "Takes a 1 that stops it; null: it cannot be stopped.", problem=url_problem)
+    unit: EnergyUnit = setting(EnergyUnit.KEV, "Of pv and status_pv.")
+    tolerance: float = setting(
         0.5, "Most difference of the energy from the one that was asked for.", unit="ev", gt=0, le=1e4
     )
-    settle: float = key(
+    settle: float = setting(
         1.0, "Time that it must stay within tolerance_ev before the move has ended.", unit="s", ge=0, le=1e6
     )
-    timeout: float = key(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
-    travel: float = key(60.0, "The longest that a move may take.", unit="s", gt=0, le=1e6)
+    timeout: float = setting(2.0, "Longest wait for an answer of the IOC.", unit="s", gt=0, le=1e6)
+    travel: float = setting(60.0, "The longest that a move may take.", unit="s", gt=0, le=1e6)
 
     @property
     def per_kev(self) -> float:

@@ -1,35 +1,22 @@
 """Settings of a stage: the values that every driver takes, and how a configuration writes each of them.
 
-A driver's settings are a frozen dataclass in radians and seconds. `key` says with each field how a configuration file
-writes it: its unit, which ends the key's name, its legal values and its meaning.
+A driver's settings are a frozen dataclass in radians and seconds. Each field declares by `setting` how a configuration
+file writes it: its unit, which ends the key's name, its legal values and its meaning.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage, StageLimits
-from drivers.keys import CheckedSettings, Key
-from drivers.keys import key as key
+from recon.base.setting import CheckedSettings, setting
 
 FARTHEST = 1e9  # rad
 MOST = 2.0**53  # counts: the largest whole numbers that a float holds exactly
-
-
-def with_keys(name: str, driver: Any) -> Any:
-    """Check that a configuration can write every field of the settings of another package's driver.
-
-    Raises:
-        ValueError: it cannot.
-    """
-    without = [field.name for field in fields(driver.Settings) if not isinstance(field.metadata.get("key"), Key)]
-    if without:
-        raise ValueError(f"{', '.join(without)} of {driver.Settings.__name__} have no key(...)")
-    return driver
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,11 +29,11 @@ class StageFigures(CheckedSettings):
 
     stand_in: ClassVar[str] = ""
     """The kind of stage that is simulated in the place of this one; "": this one has a simulated controller itself."""
-    counts_per_turn: int = key(doc="Motor pulses or encoder counts for 360 deg; triggers fall on whole ones.", gt=0)
-    max_speed: float = key(unit="deg_s", gt=0)
-    acceleration: float = key(unit="deg_s2", gt=0)
-    low: float = key(-5.0, unit="deg")
-    high: float = key(365.0, "The stage is never sent beyond low_deg and high_deg.", unit="deg")
+    counts_per_turn: int = setting(doc="Motor pulses or encoder counts for 360 deg; triggers fall on whole ones.", gt=0)
+    max_speed: float = setting(unit="deg_s", gt=0)
+    acceleration: float = setting(unit="deg_s2", gt=0)
+    low: float = setting(-5.0, unit="deg")
+    high: float = setting(365.0, "The stage is never sent beyond low_deg and high_deg.", unit="deg")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -103,13 +90,13 @@ class Wiring(CheckedSettings):
     The baud rate is the controller's, nominal over USB and TCP.
     """
 
-    timeout: float = key(1.0, "For a reply.", unit="s", gt=0)
-    baudrate: int = key(115_200, gt=0)
-    pulse_width: float | None = key(
+    timeout: float = setting(1.0, "For a reply.", unit="s", gt=0)
+    baudrate: int = setting(115_200, gt=0)
+    pulse_width: float | None = setting(
         None, "Width of the trigger pulses; null: the driver's choice, or what the controller has.", unit="s", gt=0
     )
-    active_high: bool = key(True, "Trigger pulses are high; refused where the controller has no such choice.")
-    transcript: Path | None = key(
+    active_high: bool = setting(True, "Trigger pulses are high; refused where the controller has no such choice.")
+    transcript: Path | None = setting(
         None, "A file to which every byte to and from the controller is appended with its time; null: none."
     )
 

@@ -15,7 +15,7 @@ from enum import Enum
 from functools import cache
 from numbers import Real
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -36,34 +36,6 @@ _WORDS: Mapping[Any, str] = {
     np.ndarray: "an array",
     _NUMBERS: "an array of numbers",
 }
-
-
-class Bound(NamedTuple):
-    """Range of a number that a field declares: `Annotated[int, Bound(1, 16)]`; the number is finite.
-
-    Attributes:
-        low, high: ends that belong to it.
-        above: `low` itself does not belong to it.
-    """
-
-    low: int
-    high: float = math.inf
-    above: bool = False
-
-    def holds(self, number: Any) -> bool:
-        return bool(self.low <= number <= self.high and number < math.inf) and not (self.above and number == self.low)
-
-    @property
-    def words(self) -> str:
-        if self.high < math.inf:
-            return f"from {self.low} to {self.high}"
-        return f"above {self.low}" if self.above else f"of {self.low} or more"
-
-
-Natural = Annotated[int, Bound(0)]
-Count = Annotated[int, Bound(1)]
-NonNegative = Annotated[float, Bound(0)]
-Positive = Annotated[float, Bound(0, above=True)]
 
 
 class _Unresolved:
@@ -122,7 +94,7 @@ def _alternatives(kind: Any) -> list[Any]:
 def _fits(value: Any, kind: Any) -> bool:
     origin, args = get_origin(kind) or kind, get_args(kind)
     if origin is Annotated:
-        return _fits(value, args[0]) and args[1].holds(value)
+        return is_of_type(value, args[0]) and not args[1].fault(value)
     if origin is Literal:
         return isinstance(value, str | int) and value in args
     if origin is int:
@@ -208,7 +180,7 @@ def shown(value: object) -> str:
 
 
 def check_arguments(function: Callable[..., Any], values: Mapping[str, Any]) -> None:
-    """Raise ValueError for an argument of another type than the function declares, or a number beyond its `Bound`.
+    """Raise ValueError for an argument of another type than the function declares, or a number beyond its bounds.
 
     So it does for masked values: numpy computes with what lies below a mask. A function that can leave them out calls
     `without_mask` before.
@@ -236,7 +208,7 @@ class Checked:
 
 def check_settings(settings: Any) -> None:
     """Raise ValueError for a value of a dataclass that its field does not declare: of another type, a name that is not
-    among those of a Literal, or a number beyond the field's `Bound`.
+    among those of a Literal, or a number beyond the field's bounds.
 
     An array without axes, as an .npz gives a number, becomes the number.
     """

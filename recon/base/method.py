@@ -1,7 +1,6 @@
 """Method: the interface of every reconstruction method, and the values that go in and come out.
 
-A method is a frozen dataclass of its settings that meets the Protocol `Method`. `recon.methods` registers it. Abilities
-of some methods are Protocols beside it.
+A method is a frozen dataclass of its settings, a `Method`. `recon.methods` registers it.
 """
 
 from __future__ import annotations
@@ -9,10 +8,11 @@ from __future__ import annotations
 import json
 import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32, F64
 from recon.base.choices import Quality
 from recon.base.decisions import Decisions, Stop
-from recon.base.declared_types import Checked
+from recon.base.declared_types import Checked, types_of
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
 from recon.base.volume import Grid, Volume, VolumeSeries
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 Plain = str | int | float
 Clock = Callable[[], float]
+_ENDLESS = 10**6  # steps or iterations: a time ends the run long before
 
 
 @dataclass(frozen=True)
@@ -272,54 +273,42 @@ class Reconstruction:
         self.volume.save(path, method=self.method, seconds=self.seconds, settings=text)
 
 
-@dataclass(frozen=True)
-class Traits:
-    """Abilities of a method, beyond turning line integrals into a volume.
+class Method(Checked, ABC):
+    """A reconstruction method: a frozen dataclass of its settings, and what its callers ask it.
 
-    Attributes:
-        direct: one pass without iterations: it has no history, and cannot be stopped.
-        device: it computes on any device, not only on the CPU.
-        held_out: views can be held out.
-        checkpoints: its state can be saved and continued.
-        presets: a quality preset chooses its settings.
-        budget: a time budget leaves out candidates of it.
-        needs_matter: it refuses views without matter, such as those of a slab of air.
-        in_time: it makes several volumes, at times of the scan, all at once in memory: `volumes` of them, which all
-            views determine together; `Reconstruction.series` has all.
-        least_views: of each of several volumes.
-        own_length: more iterations than its own bring it no nearer, or are a schedule: a time may only end them early.
-        halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
-        error_bars: factors of what refits differ by, and of the gradient, see `recon.error_bars`; None: not calibrated.
-    """
-
-    direct: bool = False
-    device: bool = False
-    held_out: bool = False
-    checkpoints: bool = False
-    presets: bool = False
-    budget: bool = False
-    needs_matter: bool = False
-    in_time: bool = False
-    least_views: int = 0
-    own_length: bool = False
-    halo: int = 0
-    error_bars: tuple[float, float] | None = None
-
-
-@runtime_checkable
-class Method(Protocol):
-    """A reconstruction method: a frozen dataclass whose fields are its settings.
+    A method derives from one of the four kinds in `recon.base.method_kinds`, which answer for it.
 
     Attributes:
         name: in commands, files and events.
         label: in reports.
-        traits: its abilities.
+        takes: what it accepts beside views, grid and seed: device, held_out, times, checkpoints, quality, budget.
+        halo: slices beyond a slab that it reconstructs, too, so that the slab's edges do not show.
+        error_bars: factors of what refits differ by, and of the gradient, see `recon.error_bars`; None: not calibrated.
+        fitted: its volume is fitted to the views step by step: it has a history, and can be stopped.
+        weighs: weights of rays count; else rays of weight 0 are filled, and all others count alike.
+        needs_matter: it refuses views without matter, such as those of a slab of air.
+        knows_outside: it explains views by a box that holds all of a sample wider than the field.
+        makes_boxes: it makes any box of voxels as it makes the whole volume.
+        volumes: number of volumes that it makes.
+        least_views: of each of several volumes.
+        allow_negative: voxels below zero are kept.
     """
 
     name: ClassVar[str]
     label: ClassVar[str]
-    traits: ClassVar[Traits]
+    takes: ClassVar[frozenset[str]] = frozenset()
+    halo: ClassVar[int] = 0
+    error_bars: ClassVar[tuple[float, float] | None] = None
+    fitted: ClassVar[bool] = True
+    weighs: ClassVar[bool] = True
+    needs_matter: ClassVar[bool] = False
+    knows_outside: ClassVar[bool] = True
+    makes_boxes: ClassVar[bool] = False
+    least_views: ClassVar[int] = 0
+    volumes: int = 1
+    allow_negative: bool = False
 
+    @abstractmethod
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         """Reconstruct.
 
@@ -327,40 +316,56 @@ class Method(Protocol):
             ValueError: the method does not take these views, settings or data.
         """
 
+    @abstractmethod
     def toy(self) -> Self:
         """The same method with the least work that still runs each of its kernels."""
 
+    @abstractmethod
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         """Peak memory of `run` in bytes, without the projections, and without their weights if they are `weighted`."""
 
+    def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
+        """[view] which of these views it uses.
 
-@runtime_checkable
-class PresetMethod(Method, Protocol):
-    """A method with the trait `presets`."""
+        Raises:
+            ValueError: it takes no such views.
+        """
+        return np.ones(geometry.n_views, bool)
+
+    @property
+    def time_limit(self) -> float | None:
+        """Seconds that end a run; None: only its work does."""
+        return None
+
+    @property
+    def stops_early(self) -> bool:
+        """Whether views held out may end a run."""
+        return False
+
+    @property
+    def trial_sweeps(self) -> int:
+        """Sweeps over the views of all trials that choose its prior, as a rule."""
+        return 0
+
+    @property
+    def alternatives(self) -> tuple[Method, ...]:
+        """The methods that it chooses among, the preferred one first; itself if it does not choose."""
+        return (self,)
+
+    def device_of(self, problem: ReconProblem) -> str:
+        """The device on which it computes this problem."""
+        return problem.device if "device" in self.takes else "cpu"
+
+    def for_part(self, share: float, of_time: float) -> Self:
+        """The method for this share of a volume, in this share of its seconds."""
+        return self
 
     def with_quality(self, quality: Quality, default_count: int) -> Self:
         """The method with the settings of a preset, for a grid with `default_count` Gaussians by default."""
+        return self
 
-
-M = TypeVar("M")
-
-
-def setting(method: Any, name: str, default: Any = None) -> Any:
-    """A setting that some methods have, such as `seconds`, `early_stop` or `allow_negative`."""
-    return getattr(method, name, default)
-
-
-def for_part(method: M, share: float, of_time: float) -> M:
-    """The method for this share of a volume, in this share of its seconds; itself if its settings depend on neither."""
-    divided = getattr(method, "for_part", None)
-    return method if divided is None else divided(share, of_time)
-
-
-def volumes_of(method: Any) -> int:
-    """Number of volumes that a method makes."""
-    return int(method.volumes) if method.traits.in_time else 1
-
-
-def candidates_of(method: Method) -> tuple[Method, ...]:
-    """The methods that `method` chooses among, the preferred one first; itself if it does not choose."""
-    return tuple(setting(method, "candidates", (method,)))
+    @classmethod
+    def ended_by(cls, seconds: float) -> dict[str, Plain]:
+        """The settings with which so many seconds, and nothing else, end a run; none where its own length remains."""
+        lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
+        return {name: value for name, value in lengths.items() if name in types_of(cls)}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from recon.base.declared_types import Checked, NonNegative
+from recon.base.declared_types import Checked
+from recon.base.setting import NonNegative
 
 
 @dataclass(frozen=True)

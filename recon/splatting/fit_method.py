@@ -1,10 +1,11 @@
-"""FitMethod: the interface of a fit of Gaussians, whose volume can grow while views arrive."""
+"""Fit: the kind of methods that fit Gaussians, whose volume can grow while views arrive."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
+from abc import abstractmethod
+from typing import TYPE_CHECKING, ClassVar, Self
 
-from recon.base.method import Method
+from recon.base.method_kinds import Iterative
 
 if TYPE_CHECKING:  # whoever asks whether a method is a fit loads none
     from collections.abc import Mapping
@@ -17,49 +18,48 @@ if TYPE_CHECKING:  # whoever asks whether a method is a fit loads none
     from recon.splatting.stream import StreamingFit
 
 
-@runtime_checkable
-class FitMethod(Method, Protocol):
-    """A fit of Gaussians with these settings, see `R2`."""
+class Fit(Iterative):
+    """A fit of Gaussians with these settings, see `R2`; its volume can grow while views arrive."""
+
+    takes: ClassVar[frozenset[str]] = frozenset({"device", "held_out", "checkpoints", "quality"})
+    needs_matter: ClassVar[bool] = True
+
+    steps: int | None
+    seconds: float | None
+    early_stop: bool
+    gaussians: int | Gaussians | None
+    start: Start
+    finish: int | None
+    fit: FitSettings
 
     @property
-    def steps(self) -> int | None: ...
+    def time_limit(self) -> float | None:
+        return self.seconds
 
     @property
-    def seconds(self) -> float | None: ...
+    def stops_early(self) -> bool:
+        return self.early_stop
 
     @property
-    def early_stop(self) -> bool: ...
-
-    @property
-    def allow_negative(self) -> bool: ...
-
-    @property
-    def gaussians(self) -> int | Gaussians | None: ...
-
-    @property
-    def start(self) -> Start: ...
-
-    @property
-    def finish(self) -> int | None: ...
-
-    @property
-    def fit(self) -> FitSettings: ...
-
-    @property
+    @abstractmethod
     def planned_steps(self) -> int | None:
         """Number of steps; None if a time ends the fit."""
 
     @property
+    @abstractmethod
     def provenance(self) -> tuple[FitSettings, Mapping[str, Plain]]:
         """All settings that determine the steps, which a resumed run must share, and more by name."""
 
-    def for_trial(self, share: float, of_steps: float) -> Self:
-        """The fit alone, of this share of the rows, with this share of the steps."""
-
     @property
+    @abstractmethod
     def finish_sweeps(self) -> int:
         """Sweeps of total variation in the finish; 0 without a finish."""
 
+    @abstractmethod
+    def for_trial(self, share: float, of_steps: float) -> Self:
+        """The fit alone, of this share of the rows, with this share of the steps."""
+
+    @abstractmethod
     def stream(self, template: Geometry, seed: int, now: Clock) -> StreamingFit:
         """A fit that grows while views with the geometry of `template`, whose angles are ignored, arrive.
 

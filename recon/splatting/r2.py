@@ -9,13 +9,14 @@ from typing import ClassVar, Self
 
 from recon.assess.time_model import PRESETS
 from recon.base.choices import Quality, Start
-from recon.base.declared_types import Checked, Count, Natural, NonNegative
 from recon.base.empirical import DEFAULT_STEPS
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunControl
+from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.splatting.anytime import while_views_come
 from recon.splatting.finish import FINISH_SWEEPS
+from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count
 from recon.splatting.settings import DensityPolicy, FitSettings, growth
@@ -31,7 +32,7 @@ _TOY_STEPS, _TOY_GAUSSIANS = 4, 50
 
 
 @dataclass(frozen=True, eq=False)
-class R2(Checked):
+class R2(Fit):
     """R²-Gaussian fit: Gaussians fitted to the views (Zha et al. 2024, refined).
 
     Attributes:
@@ -52,15 +53,8 @@ class R2(Checked):
 
     name: ClassVar[str] = "r2"
     label: ClassVar[str] = "R²-Gaussian"
-    traits: ClassVar[Traits] = Traits(
-        device=True,
-        held_out=True,
-        checkpoints=True,
-        presets=True,
-        needs_matter=True,
-        halo=16,
-        error_bars=(2.2, 0.1),
-    )
+    halo: ClassVar[int] = 16
+    error_bars: ClassVar[tuple[float, float] | None] = 2.2, 0.1
 
     steps: Natural | None = None
     seconds: NonNegative | None = None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32
 from recon.base.choices import KERNEL, Loss
-from recon.base.declared_types import Checked, Count, NonNegative, Positive, check_settings
+from recon.base.declared_types import Checked, check_settings
 from recon.base.empirical import (
     APART,
     DEFAULT_STEPS,
@@ -27,6 +27,7 @@ from recon.base.empirical import (
     VIEWS_A_STEP,
 )
 from recon.base.kernel import Kernel, RayModel, Truncation
+from recon.base.setting import Count, NonNegative, Positive
 from recon.base.volume import Grid
 from recon.splatting.problem import FitProblem
 

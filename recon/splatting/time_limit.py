@@ -10,10 +10,11 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from recon.base.geometry import Geometry
-from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method_kinds import Iterative
 from recon.base.volume import Grid
 from recon.splatting.finish import FINISH_SWEEPS, finish
-from recon.splatting.fit_method import FitMethod
+from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
@@ -97,7 +98,7 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     return FinishPlan(sweeps, before + sweeps * sweep, trials)
 
 
-def planned_finish(method: FitMethod, remaining: float, steps: float, problem: ReconProblem, now: Clock) -> FinishPlan:
+def planned_finish(method: Fit, remaining: float, steps: float, problem: ReconProblem, now: Clock) -> FinishPlan:
     """The finish of a method in its share of the remaining seconds, of which all steps take `steps`.
 
     If the time suffices for two sweeps, the method's own number is used.
@@ -108,7 +109,7 @@ def planned_finish(method: FitMethod, remaining: float, steps: float, problem: R
 
 
 @dataclass(frozen=True, eq=False)
-class FinalFit:
+class FinalFit(Iterative):
     """The last round of a fit, over the views that it was already fitted to, and the sweeps after it.
 
     Attributes:
@@ -121,7 +122,7 @@ class FinalFit:
     """
 
     fit: StreamingFit
-    method: FitMethod
+    method: Fit
     seconds: float
     began: float
     before: Sequence[Progress] = ()
@@ -129,7 +130,6 @@ class FinalFit:
 
     name: ClassVar[str] = "the last round"
     label: ClassVar[str] = "Last round of a fit whose views came one by one"
-    traits: ClassVar[Traits] = Traits()
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         """The volume, marked with the name of the method that began it.

@@ -25,7 +25,7 @@ from recon.splatting import optimise as fit
 from recon.splatting.backend import Backend, backend_for
 from recon.splatting.checkpoint import HeldOutTracker, arrays_of, state_from
 from recon.splatting.finish import finish
-from recon.splatting.fit_method import FitMethod
+from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians, turned_by_rows
 from recon.splatting.initialise import (
     default_count,
@@ -71,7 +71,7 @@ class _FitViews:
     count: int
 
     @classmethod
-    def of(cls, method: FitMethod, problem: ReconProblem) -> _FitViews:
+    def of(cls, method: Fit, problem: ReconProblem) -> _FitViews:
         if problem.geometry.skew and isinstance(method.gaussians, Gaussians):
             raise ValueError(
                 "a fit whose rows have different angles cannot start from given Gaussians: give their number"
@@ -156,7 +156,7 @@ class _Length:
 class _Run:
     """A fit on its way: what its phases share."""
 
-    method: FitMethod
+    method: Fit
     problem: ReconProblem
     control: RunControl
     decide: Decisions
@@ -202,7 +202,7 @@ class _Run:
         return arrays_of(state, self.fitting.backend) | self.tracker.arrays()
 
 
-def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Reconstruction:
+def run_fit(method: Fit, problem: ReconProblem, control: RunControl) -> Reconstruction:
     """Fit the line integrals of a problem; see `R2`.
 
     Raises:
@@ -229,7 +229,7 @@ def run_fit(method: FitMethod, problem: ReconProblem, control: RunControl) -> Re
 
 
 def _started(
-    method: FitMethod, problem: ReconProblem, control: RunControl, decide: Decisions, views: _FitViews, begin: float
+    method: Fit, problem: ReconProblem, control: RunControl, decide: Decisions, views: _FitViews, begin: float
 ) -> _Run:
     """The fit before its first step, or as a checkpoint holds it."""
     settings, start, backend = method.fit, method.gaussians, backend_for(problem.device)

@@ -11,7 +11,7 @@ from recon.base.arrays import F32, F64
 from recon.base.decisions import Prior
 from recon.base.geometry import Geometry
 from recon.splatting.finish import FINISH_SWEEPS, beyond_voxels, level_of, refine
-from recon.splatting.fit_method import FitMethod
+from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.voxels.choice import Prediction, TrialChoice, significantly_better
 from recon.voxels.projector import projection_lines
@@ -27,7 +27,7 @@ FIRST_SHARE = 0.25
 """Of the steps of a trial fit, after which it is looked at first. Without: 0.9 CPU s more, of 3."""
 
 
-def predict(method: FitMethod, trial: Trial, so_far: TrialChoice, prior: Prior) -> Prediction:
+def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Prediction:
     """The prediction of a fit of the views that are not held out: a fit of all views would know the others.
 
     It ends after a quarter of its steps where it then leads the simpler candidates, or is far behind total variation.
@@ -67,7 +67,7 @@ class _Fit:
     beyond_unseen: F32 | None
 
     @classmethod
-    def of(cls, method: FitMethod, trial: Trial, share: float) -> _Fit:
+    def of(cls, method: Fit, trial: Trial, share: float) -> _Fit:
         """The fit with this share of its steps.
 
         Raises:

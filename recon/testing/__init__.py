@@ -20,11 +20,9 @@ from recon.base.geometry import Geometry
 from recon.base.method import (
     DataUse,
     Method,
-    PresetMethod,
     ReconProblem,
     Reconstruction,
     RunControl,
-    Traits,
 )
 from recon.base.view_data import Views
 from recon.base.volume import Grid
@@ -62,7 +60,7 @@ class MethodConformance:
 
     def test_it_is_an_immutable_value_that_says_who_it_is(self, method: Method) -> None:
         assert is_dataclass(method) and method.__dataclass_params__.frozen
-        assert method.name and method.label and isinstance(method.traits, Traits)
+        assert method.name and method.label and isinstance(method, Method)
         type(method)()  # every setting has a default
 
     def test_its_volume_is_on_the_grid_and_has_the_matter_where_it_is(self, method: Method) -> None:
@@ -94,7 +92,7 @@ class MethodConformance:
         control = RunControl(should_stop=lambda: True, on_progress=lambda progress: told.append(progress.step))
         result = method.run(problem(), control)
         assert result.volume.data.shape == GRID.shape
-        if method.traits.direct:
+        if not method.fitted:
             assert result.history == ()
         else:
             assert told and result.history
@@ -108,14 +106,13 @@ class MethodConformance:
         assert method.memory(VIEWS, GRID, False) <= method.memory(VIEWS, GRID, True)
         assert method.memory(VIEWS, GRID, False) < method.memory(VIEWS, tall, False)
 
-    def test_it_can_do_what_its_traits_say(self, method: Method) -> None:
-        traits = method.traits
-        assert traits.presets is isinstance(method, PresetMethod)
-        assert isinstance(traits.halo, int) and traits.halo >= 0
-        if traits.held_out:
+    def test_it_takes_what_it_says(self, method: Method) -> None:
+        assert method.takes <= {"device", "held_out", "times", "checkpoints", "quality", "budget"}
+        assert method.halo >= 0 and method.volumes >= 1
+        if "held_out" in method.takes:
             result = method.run(replace(problem(), use=DataUse(held_out=[5, 17])), RunControl())
             assert np.isfinite([progress.held_out for progress in result.history]).any()
-        if traits.checkpoints:
+        if "checkpoints" in method.takes:
             resumed = self._resumed(method, whole(method).checkpoint)
             np.testing.assert_array_equal(resumed.volume.data, whole(method).volume.data)
 

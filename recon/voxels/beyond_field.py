@@ -19,7 +19,7 @@ from recon.base.decisions import Decisions
 from recon.base.empirical import LIGHT_WEIGHT
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import SAMPLE, Method, ReconProblem, Reconstruction, RunControl, SampleRadius, Traits
+from recon.base.method import SAMPLE, Method, ReconProblem, Reconstruction, RunControl, SampleRadius
 from recon.base.view_data import Views
 from recon.base.views import spread_views
 from recon.base.volume import Grid, Volume
@@ -55,7 +55,7 @@ def run_on_extended_grid(method: Method, problem: ReconProblem, control: RunCont
         ValueError: as `Method.run`.
     """
     decide = control.decide or Decisions(problem.seed)
-    if not knows_outside(method.traits):
+    if not method.knows_outside:
         return method.run(problem, control)
 
     data, views, grid = problem.projections, problem.geometry, problem.grid
@@ -89,11 +89,6 @@ class _Outside:
         matter = np.maximum(self.whole, 0)
         matter[self.field] = 0
         return Projector(views, self.box).forward(matter)
-
-
-def knows_outside(traits: Traits) -> bool:
-    """Whether a method explains views by a box that holds all of the sample."""
-    return not (traits.direct or traits.in_time)
 
 
 def sample_radius(views: Views, given: float | SampleRadius | None = None) -> SampleRadius | None:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from recon.base.arrays import F32, F64
-from recon.base.declared_types import Checked
 from recon.base.geometry import Geometry, require_views
-from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import ReconProblem, Reconstruction, RunControl
+from recon.base.method_kinds import Direct
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume
 from recon.kernels.cpu.activation import OPTIONS
@@ -297,7 +297,7 @@ def _prepared(
 
 
 @dataclass(frozen=True)
-class Fbp(Checked):
+class Fbp(Direct):
     """Filtered back-projection (FDK for a cone).
 
     Attributes:
@@ -306,7 +306,7 @@ class Fbp(Checked):
 
     name: ClassVar[str] = "fbp"
     label: ClassVar[str] = "FBP"
-    traits: ClassVar[Traits] = Traits(direct=True, error_bars=(1.0, 0.7))
+    error_bars: ClassVar[tuple[float, float] | None] = 1.0, 0.7
 
     filter: Filter = "hann"
 
@@ -319,6 +319,12 @@ class Fbp(Checked):
 
         data = direct(filled, problem.geometry, problem.grid, self.filter, progress, device=problem.device)
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
+
+    def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
+        """All but wide views. ValueError for a cone's views that FDK does not take."""
+        if geometry.is_cone and missing_arc(geometry) > 0:
+            cone_weights(geometry)  # says how many degrees they lack
+        return super().views_wanted(geometry)
 
     def toy(self) -> Self:
         return self

@@ -10,20 +10,21 @@ in other units sums of their squares could exceed the range of float32.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from typing import ClassVar, Protocol, Self, runtime_checkable
+from typing import ClassVar, Protocol, Self
 
 import numpy as np
 from numba import get_num_threads, set_num_threads
 
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
-from recon.base.declared_types import Checked, Count
 from recon.base.geometry import Geometry, require_views
 from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method_kinds import Iterative
+from recon.base.setting import Count
 from recon.base.volume import Grid, Volume
 from recon.voxels.choice import MOST_TRIALS
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
@@ -36,12 +37,8 @@ TV_WEIGHT_CHOSEN = "tv_weight_chosen"
 _SHARE = 2**16  # voxels of a thread in a single slice: with fewer, threads wait for each other more than they work
 
 
-@runtime_checkable
-class IterativeMethod(Protocol):
-    """An iterative method on voxels, such as `recon.features.iterative.methods.Sirt`."""
-
-    @property
-    def iterations(self) -> int: ...
+class Iterating(Protocol):
+    """What `solve` runs: a `VoxelMethod`, or a part of one."""
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         """The volume [y, x, z] after the iterations, from `x`, which is overwritten."""
@@ -91,7 +88,7 @@ class TrialWatch:
 
 
 def solve(
-    method: IterativeMethod,
+    method: Iterating,
     projector: Projector,
     projections: F32,
     *,
@@ -158,29 +155,24 @@ def scaled_problem(
 
 
 @dataclass(frozen=True)
-class VoxelMethod(Checked, ABC):
+class VoxelMethod(Iterative):
     """A method whose iterations improve a volume of voxels; a subclass adds its settings.
 
     Attributes:
         buffers: at the peak of a run.
         first_sweeps: over the views, for the first volume; they are counted before the iterations.
-        trial_sweeps: those of all trials that choose its prior, as a rule.
     """
 
     buffers: ClassVar[Buffers]
     first_sweeps: ClassVar[int] = 0
     iterations: Count
 
-    @property
-    def trial_sweeps(self) -> int:
-        return 0
-
     def memory(self, geometry: Geometry, grid: Grid, weighted: bool) -> int:
         return bytes_of(self.buffers, geometry, grid, weighted)
 
     @abstractmethod
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
-        """Iterate, see `IterativeMethod`."""
+        """See `Iterating`."""
 
     def toy(self) -> Self:
         return replace(self, iterations=1)
@@ -205,7 +197,7 @@ class VoxelMethod(Checked, ABC):
         watch = Watch(report, TrialWatch(control, views, self.trial_sweeps))
         volume = solve(
             self, Projector(problem.geometry, problem.grid, device=problem.device), given.data, weight=given.weights,
-            nonnegative=not settings["allow_negative"], watch=watch, decide=decide,
+            nonnegative=not self.allow_negative, watch=watch, decide=decide,
         )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
         return Reconstruction(volume, {**settings, **chosen, "seed": problem.seed}, tuple(history))

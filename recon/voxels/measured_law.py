@@ -30,7 +30,7 @@ from recon.voxels.beyond_field import offset_error, sample_radius
 from recon.voxels.choice import preferred_strength
 from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import busiest_rows, slab_of
-from recon.voxels.iterative import IterativeMethod, solve
+from recon.voxels.iterative import Iterating, solve
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.residuals import unseen_residuals
@@ -180,7 +180,7 @@ class _Slab:
         geometry, box = slab_of(geometry, Grid.matching(geometry), 0, geometry.detector_shape[0])
         return cls(views, geometry, box.reaching(width * geometry.reach, geometry) if width > 1 else box, noise)
 
-    def volume(self, method: IterativeMethod, views: F32, used: NDArray[np.intp]) -> F32:
+    def volume(self, method: Iterating, views: F32, used: NDArray[np.intp]) -> F32:
         """[z, y, x], made of the views that are used (their numbers), from filtered back-projection of them."""
         geometry, images = self.geometry.select(used), np.ascontiguousarray(views[used])
         start = Volume(np.maximum(fbp(images, geometry, self.box, filter="hann"), 0), self.box)

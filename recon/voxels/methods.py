@@ -10,10 +10,10 @@ from typing import ClassVar
 
 from recon.base.arrays import F32
 from recon.base.decisions import GoesOn, Prior
-from recon.base.declared_types import Count, Natural, NonNegative
 from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.geometry import Geometry
-from recon.base.method import Traits
+from recon.base.method import Plain
+from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
 from recon.voxels.choice import TRIALS, Prediction, TrialChoice
@@ -49,7 +49,9 @@ class FistaTv(VoxelMethod):
 
     name: ClassVar[str] = "fista-tv"
     label: ClassVar[str] = "FISTA-TV"
-    traits: ClassVar[Traits] = Traits(device=True, halo=12, error_bars=(2.2, 0.1))
+    takes: ClassVar[frozenset[str]] = frozenset({"device"})
+    halo: ClassVar[int] = 12
+    error_bars: ClassVar[tuple[float, float] | None] = 2.2, 0.1
     buffers: ClassVar[Buffers] = Buffers(7.3, 3.0, 4.8, filtered=True)
 
     iterations: Count = TRIAL_SWEEPS
@@ -112,7 +114,7 @@ class OsSirtTv(VoxelMethod):
 
     name: ClassVar[str] = "os-sirt-tv"
     label: ClassVar[str] = "OS-SIRT-TV"
-    traits: ClassVar[Traits] = Traits(halo=20)
+    halo: ClassVar[int] = 20
     buffers: ClassVar[Buffers] = Buffers(8.1, 5.2, 8.2, filtered=True)
 
     iterations: Count = 40
@@ -174,7 +176,9 @@ class PnpDct(VoxelMethod):
 
     name: ClassVar[str] = "pnp-dct"
     label: ClassVar[str] = "PnP-DCT"
-    traits: ClassVar[Traits] = Traits(device=True, halo=16, own_length=True, error_bars=(2.3, 0.25))
+    takes: ClassVar[frozenset[str]] = frozenset({"device"})
+    halo: ClassVar[int] = 16
+    error_bars: ClassVar[tuple[float, float] | None] = 2.3, 0.25
     buffers: ClassVar[Buffers] = Buffers(5.3, 3.0, 2.2)
 
     iterations: Count = PATCH_STEPS
@@ -192,6 +196,11 @@ class PnpDct(VoxelMethod):
     def trial_steps(self) -> int:
         """Steps with patches of a trial: as many as of the volume, and the usual number at most."""
         return min(self.iterations, PnpDct.iterations)
+
+    @classmethod
+    def ended_by(cls, seconds: float) -> dict[str, Plain]:
+        """None: the steps are a schedule."""
+        return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction with the best threshold; with one of its own that of the method's volume."""

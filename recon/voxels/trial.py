@@ -129,7 +129,7 @@ _USUAL = TrialSettings()
 
 
 @runtime_checkable
-class Predicting(Method, Protocol):
+class Predicting(Protocol):
     """A method that tells by a part of its work how well its volume predicts views held out."""
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
@@ -328,8 +328,7 @@ class Trial:
     def views_of(self, method: Method) -> ReconProblem:
         """The views that are not held out as a method gets them, with all columns and in the units of the scan."""
         problem = self.all_columns.seen().of_scan
-        device = problem.device if method.traits.device else "cpu"
-        return replace(problem, device=device, wide=self.settings.wide)
+        return replace(problem, device=method.device_of(problem), wide=self.settings.wide)
 
     def lines_of(self, volume: Volume) -> F32:
         """A volume made of `views_of` as one of the trial, [y, x, z]."""

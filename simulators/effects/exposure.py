@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 
+from recon.base.setting import setting
 from simulators.effects.chain import AreaEffect, ImageEffect, SamplingEffect
 from simulators.frame.mapping import BelowOne, Positive
 from simulators.frame.shot import Image, Moments, Shot
@@ -32,7 +31,7 @@ class MotionBlur(SamplingEffect):
     """
 
     tolerance_px: Positive = 0.5
-    max_samples: Annotated[int, Field(ge=2)] = 16
+    max_samples: int = setting(16, ge=2)
 
     def moments(self, moments: Moments, shot: Shot) -> Moments:
         n = self.samples(shot)
@@ -63,7 +62,7 @@ class PixelArea(AreaEffect):
         rays: a side of the pixel, 2 ... 8; each of the rays² costs the line integrals of a frame.
     """
 
-    rays: Annotated[int, Field(ge=2, le=8)] = 2
+    rays: int = setting(2, ge=2, le=8)
 
     @property
     def offsets(self) -> tuple[tuple[float, float], ...]:

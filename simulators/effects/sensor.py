@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from drivers.orca_quest import BITS, QE_NM, LightPath, quantum_efficiency
+from recon.base.setting import setting
 from simulators.effects.chain import ImageEffect
 from simulators.frame.mapping import NotNegative, Positive, Share, Whole
 from simulators.frame.sensor import DARK_CURRENT, FULL_WELL, OFFSET, READ_NOISES
@@ -32,7 +32,7 @@ class QuantumEfficiency(ImageEffect):
     """
 
     value: Share | None = None
-    wavelength_nm: Annotated[float, Field(ge=QE_NM[0], le=QE_NM[-1])] | None = None
+    wavelength_nm: float | None = setting(None, ge=QE_NM[0], le=QE_NM[-1])
     path: LightPath | None = None
 
     def __post_init__(self) -> None:
@@ -130,7 +130,7 @@ class ReadNoise(ImageEffect):
     """
 
     rms: NotNegative | None = None
-    spread: Annotated[float, Field(ge=0, le=2)] = 0.0
+    spread: float = setting(0.0, ge=0, le=2)
     seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
@@ -183,7 +183,7 @@ class Adc(ImageEffect):
     """
 
     bits: Literal[8, 12, 16] = 16
-    nonlinearity: Annotated[float, Field(ge=-0.25, le=0.25)] = 0.0
+    nonlinearity: float = setting(0.0, ge=-0.25, le=0.25)
 
     def apply(self, image: Image, shot: Shot) -> Image:
         """Raises CannotExposeError in the photon number readout, unless the converter is linear and has 16 bits."""

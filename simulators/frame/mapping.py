@@ -4,26 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from recon.base.findings import faults_of
 from recon.base.registry import unknown
+from recon.base.setting import Setting
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
-    from pydantic_core import ErrorDetails
 
 T = TypeVar("T", bound="DataclassInstance")
 
 # Types of fields with bounds; `build` refuses other values.
-Positive = Annotated[float, Field(gt=0)]
-NotNegative = Annotated[float, Field(ge=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
-BelowOne = Annotated[float, Field(ge=0, lt=1)]
-Whole = Annotated[int, Field(ge=0)]
+Positive = Annotated[float, Setting(gt=0)]
+NotNegative = Annotated[float, Setting(ge=0)]
+Share = Annotated[float, Setting(ge=0, le=1)]
+BelowOne = Annotated[float, Setting(ge=0, lt=1)]
+Whole = Annotated[int, Setting(ge=0)]
+
+
+_UNKNOWN = "unexpected_keyword_argument"  # comes first: what is missing may be a key with a wrong name
 
 
 class SceneError(ValueError):
@@ -39,12 +43,12 @@ def build(cls: type[T], where: str, mapping: Any) -> T:
     Raises:
         SceneError: an unknown or missing key, or a wrong value; its path begins with `where`.
     """
+    values = dict(mapping) if isinstance(mapping, Mapping) else mapping
     try:
-        return _adapter(cls).validate_python(dict(mapping) if isinstance(mapping, Mapping) else mapping)
+        return _adapter(cls).validate_python(values)
     except ValidationError as error:
-        faults = error.errors(include_url=False)
-        first = next((fault for fault in faults if fault["type"] == "unexpected_keyword_argument"), faults[0])
-        raise SceneError(_sentence(cls, where, first)) from None
+        findings = sorted(error.errors(include_url=False), key=lambda each: each["type"] != _UNKNOWN)
+        raise SceneError(faults_of(findings, values, _adapter(cls).json_schema(), where)[0].sentence) from None
 
 
 def named(where: str, legal: Sequence[str], entry: Any) -> tuple[str, Mapping[str, Any]]:
@@ -86,50 +90,3 @@ def _dataclasses(kind: Any) -> Iterator[Any]:
     yield from (kind,) if is_dataclass(kind) else ()
     for part in parts:
         yield from _dataclasses(part)
-
-
-def _declared_at(cls: Any, loc: Sequence[str | int]) -> Any:
-    """The dataclass at a place of the mapping; the outer one where that is in a list."""
-    for part in loc:
-        inner = [*_dataclasses(get_type_hints(cls)[part])] if isinstance(part, str) else []
-        cls = inner[0] if inner else cls
-    return cls
-
-
-_EXPECTED = {
-    "float": "a finite number",
-    "finite": "a finite number",
-    "int": "a whole number",
-    "bool": "true or false",
-    "string": "text",
-    "tuple": "a list",
-    "dict": "a mapping",
-}
-"""By the first word of the type of pydantic's error."""
-
-
-def _sentence(cls: Any, where: str, error: ErrorDetails) -> str:
-    """A sentence from pydantic's error: the path, the expected kind of value, and the value."""
-    kind, loc, value = error["type"], error["loc"], error["input"]
-    path = where + "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc if part != "[key]")
-    if kind == "value_error":
-        message = str(error["ctx"]["error"])
-        return f"{path} {message}" if message.startswith("must ") else f"{path}: {message}"
-    if kind == "dataclass_type":
-        legal = ", ".join(field.name for field in fields(_declared_at(cls, loc)))
-        return f"{path} must be a mapping with the keys {legal}; got {value!r}"
-    if kind == "unexpected_keyword_argument":
-        declared = _declared_at(cls, loc[:-1])
-        return f"{path.rpartition('.')[0]}: {unknown('key', loc[-1], [field.name for field in fields(declared)])}"
-    if kind == "missing":
-        *_, last = loc
-        return (
-            f"{path.removesuffix(f'.{last}')}: key {last!r} is missing"
-            if isinstance(last, str)
-            else (f"{path} is missing, got {value!r}")
-        )
-    if kind == "too_long":
-        return f"{path} must be a list of {error['ctx']['max_length']}, got {value!r}"
-    by_kind = _EXPECTED.get(kind.split("_")[0], error["msg"].removeprefix("Input should be "))
-    expected = error["ctx"]["expected"] if kind == "literal_error" else by_kind
-    return f"{path}{': key' if '[key]' in loc else ''} must be {expected}, got {value!r}"

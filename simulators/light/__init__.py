@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import Field
-
+from recon.base.setting import Setting, setting
 from simulators.frame.mapping import NotNegative, Positive
 
 NEAREST, FARTHEST = 1e-6, 1e9  # mm, of a cone's source: squares of far larger distances overflow
@@ -24,7 +23,7 @@ class Tube:
         filters: mm of each material in the beam; {Al: 1.0, Cu: 0.1}.
     """
 
-    kv: Annotated[float, Field(ge=5, le=800)]
+    kv: Annotated[float, Setting(ge=5, le=800)]
     filters: Mapping[str, NotNegative] | None = None
 
 
@@ -52,8 +51,8 @@ class Beam:
     sod: float | None = None
     sdd: float | None = None
     energy_kev: Positive | None = None
-    bandwidth: Annotated[float, Field(gt=0, le=0.2)] | None = None
-    harmonics: Mapping[Annotated[int, Field(ge=2)], NotNegative] | None = None
+    bandwidth: float | None = setting(None, gt=0, le=0.2)
+    harmonics: Mapping[Annotated[int, Setting(ge=2)], NotNegative] | None = None
     spectrum: tuple[tuple[Positive, NotNegative], ...] | None = None
     tube: Tube | None = None
 

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from recon.base.registry import in_folders
+from recon.base.setting import setting
 from simulators.frame.mapping import SceneError, build, choose, located, named
 from simulators.light import Beam
 from simulators.samples.bodies.phantom import Phantom
@@ -22,11 +23,9 @@ if TYPE_CHECKING:
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from simulators.samples.bodies.solids import (
     Box,
@@ -52,8 +51,8 @@ class Battery:
     """
 
     field_of_view: tuple[Millimetres, Millimetres]
-    n_particles: Annotated[int, Field(ge=0, le=5000)] = 150
-    fill: Annotated[float, Field(gt=0, le=1)] = 0.12
+    n_particles: int = setting(150, ge=0, le=5000)
+    fill: float = setting(0.12, gt=0, le=1)
     seed: int = 0
 
     def solids(self) -> tuple[Solid, ...]:

@@ -20,9 +20,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
-
 from drivers.orca_quest import SENSOR_SHAPE
+from recon.base.setting import Setting, setting
 from simulators.effects.catalogue import CATALOGUE, load_effect
 from simulators.effects.chain import Chain
 from simulators.frame.mapping import Positive, build, located, named
@@ -34,8 +33,8 @@ if TYPE_CHECKING:
     from simulators.samples.sample import ReadVolume
 
 
-Frames = Annotated[int, Field(ge=0, le=1_000_000)]  # as in a configuration
-Seconds = Annotated[float, Field(gt=0, le=1e6)]
+Frames = Annotated[int, Setting(ge=0, le=1_000_000)]  # as in a configuration
+Seconds = Annotated[float, Setting(gt=0, le=1e6)]
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,8 @@ class DetectorSettings:
     electrons_per_count: None: the camera's.
     """
 
-    shape: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = (512, 512)
-    pixel_size_um: Annotated[float, Field(ge=1e-3, le=1e6)] = 4.6
+    shape: tuple[Annotated[int, Setting(ge=1)], Annotated[int, Setting(ge=1)]] = (512, 512)
+    pixel_size_um: float = setting(4.6, ge=1e-3, le=1e6)
     exposure_s: Seconds = 0.05
     binning: Literal[1, 2, 4] = 1
     readout: Literal["standard", "ultra_quiet", "photon_number"] = "standard"
@@ -74,8 +73,8 @@ class ScanSettings:
     darks, flats: taken before the views.
     """
 
-    views: Annotated[int, Field(ge=1, le=1_000_000)] = 180
-    range_deg: Annotated[float, Field(ge=-1e6, le=1e6)] = 180.0
+    views: int = setting(180, ge=1, le=1_000_000)
+    range_deg: float = setting(180.0, ge=-1e6, le=1e6)
     period_s: Seconds = 0.1
     fly: bool = True
     darks: Frames = 10

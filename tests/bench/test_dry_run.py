@@ -21,7 +21,7 @@ from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from recon.base.arrays import F32
 from recon.base.geometry import Geometry
-from recon.base.method import Method, candidates_of
+from recon.base.method import Method
 from recon.base.volume import Grid
 from recon.forecast import forecast
 from recon.methods import by_name, names_compared
@@ -90,13 +90,13 @@ def _named(method: Method) -> str:
 @pytest.mark.parametrize("scan", SCANS)
 def test_a_run_takes_the_seconds_that_were_expected(scan: str, method: Method) -> None:
     (data, geometry), now = _views(scan), time.process_time
-    for each in candidates_of(method):
+    for each in method.alternatives:
         warm_up(each, geometry)
     begin = now()
     found = forecast(method, geometry, Grid.matching(geometry), now)
     assert found is not None
     timing = now() - begin
-    begin, repeats = now(), 5 if method.traits.direct else 1
+    begin, repeats = now(), 5 if not method.fitted else 1
     for _ in range(repeats):
         made = recon.reconstruct(data, geometry, method)
     taken = (now() - begin) / repeats

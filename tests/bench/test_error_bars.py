@@ -94,7 +94,7 @@ def test_voxels_of_the_truth_within_one_deviation(shared_data: Path, name: str, 
             end="",
         )
         assert all(share > 0.3 for share in shares.values())
-        assert method.traits.direct or bars < run
+        assert not method.fitted or bars < run
 
 
 def balls(seed: int) -> tuple[NDArray[np.float32], list[tuple[NDArray[np.float64], float]]]:

@@ -145,7 +145,7 @@ def rows_of(case: Case) -> None:
             row(case, f"{label}, equal time", replace(method, seconds=SECONDS))
             continue
         enough = 0 if EQUAL_ONLY and not hasattr(method, "iterations") else row(case, label, method)
-        if method.traits.direct or not SECONDS:
+        if not method.fitted or not SECONDS:
             continue
         if hasattr(method, "iterations"):
             longer = with_settings(method, {"iterations": enough})

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 import recon
 from recon import methods
 from recon.base.method import Method
-from recon.splatting.fit_method import FitMethod
+from recon.splatting.fit_method import Fit
 from recon.testing import MethodConformance
 from recon.voxels.projector import Projector
 
@@ -49,7 +49,7 @@ def test_registry_entries_match_their_classes(name: str) -> None:
     method = methods.by_name(name)
     assert method.name == name and method.label
     assert is_dataclass(method) and getattr(recon, method.__name__) is method
-    assert methods.streams(name) is isinstance(method(), FitMethod)
+    assert methods.streams(name) is issubclass(method, Fit)
 
 
 def test_settings_are_built_by_name() -> None:

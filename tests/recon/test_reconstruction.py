@@ -19,7 +19,7 @@ from recon import R2, DataUse, Fbp, RunControl
 from recon.assess.metrics import psnr
 from recon.axis_held_out import axis_by_views
 from recon.base.geometry import Geometry
-from recon.methods import build, by_name, names_of_one_volume, with_trait
+from recon.methods import accepting, build, by_name, names_of_one_volume
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from tests.recon.few_views import ANGLES, GRID, PITCH, SHAPE, VIEWS
@@ -115,7 +115,7 @@ MODELS = "r2", "r2-published"
 @pytest.mark.parametrize("method", [name for name in names_of_one_volume() if name not in MODELS])
 def test_no_argument_silently_does_nothing(noisy: np.ndarray, method: str) -> None:
     for name, argument in OF_A_FIT.items():
-        if "device" in name and method in with_trait("device"):
+        if "device" in name and method in accepting("device"):
             continue
         with pytest.raises(ValueError, match=rf"method '{method}' has no option {name} {OWNERS.get(name, OF_FITS)}"):
             recon.reconstruct(noisy, VIEWS, method, **argument)  # type: ignore[arg-type]

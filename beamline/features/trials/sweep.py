@@ -99,7 +99,7 @@ def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
     Raises:
         ConfigError, DataError: a scan or a selection that is refused.
     """
-    halo = max(min(trial.method.traits.halo, (_TALLEST - 1) // 2) for trial in trials)
+    halo = max(min(trial.method.halo, (_TALLEST - 1) // 2) for trial in trials)
     return [replace(trial, selection=_middle(trial, halo)) for trial in trials]
 
 
@@ -180,7 +180,7 @@ class SweptScan(TrialScan):
         """
         if not table.compared:
             raise DataError(f"No slice was made, the first because {table.outcomes[0].message}.")
-        direct = self._trials[0].options.method.traits.direct
+        direct = not self._trials[0].options.method.fitted
         if (scores := scores_of(self.unseen, direct=direct)) is None:
             outcomes = [replace(outcome, metrics={}) for outcome in table.outcomes]
             return replace(table, outcomes=tuple(outcomes), notes=[_NO_SCORE])

@@ -12,13 +12,13 @@ import numpy as np
 from beamline.core.files import REPORT
 from beamline.features.trials.view_choices import ViewChoice
 from recon.base.method import Method, Plain
-from recon.methods import build, by_name, has_setting
+from recon.base.method_kinds import Direct
+from recon.methods import build, by_name
 
 Status = Literal["done", "failed", "interrupted", "not run"]
 
 LEAST_GAIN = 0.01  # dB: the smallest difference that tables show
 _ERRORS = 2.0  # standard errors, of the difference over the views held out, that chance may reach
-_ENDLESS = 10**6  # steps or iterations: a time ends the run long before
 
 
 @dataclass(frozen=True)
@@ -65,14 +65,14 @@ class MethodTrial:
             ValueError: for a method or a setting that there is not.
         """
         method, seconds = by_name(self.method), self.seconds_asked
-        return build(method, {**self.settings, **({} if seconds is None else _ended_by_time(method, seconds))})
+        return build(method, {**self.settings, **({} if seconds is None else method.ended_by(seconds))})
 
     def in_time(self, seconds: float | None) -> MethodTrial:
         """The trial, to end after these seconds, if any; a direct method takes what it takes."""
         method = by_name(self.method)
-        if seconds is None or method.traits.direct:
+        if seconds is None or issubclass(method, Direct):
             return self
-        by_time = _ended_by_time(method, seconds)
+        by_time = method.ended_by(seconds)
         kept = {name: value for name, value in self.settings.items() if name not in by_time}
         return replace(self, settings=kept, seconds_asked=seconds)
 
@@ -84,14 +84,6 @@ class MethodTrial:
         parts = [self.method, f"{self.views} views"]
         parts += [f"{self.seconds_asked:g} s"] if self.seconds_asked is not None else []
         return ", ".join([*parts, *(f"{value} {name}" for name, value in self.settings.items())])
-
-
-def _ended_by_time(method: type[Method], seconds: float) -> dict[str, Plain]:
-    """The settings with which a time, and nothing else, ends a run of the method; see `Traits.own_length`."""
-    if method.traits.own_length:
-        return {}
-    lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
-    return {name: value for name, value in lengths.items() if has_setting(method, name)}
 
 
 HELD_OUT = "residual_held_out"

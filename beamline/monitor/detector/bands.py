@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
 from beamline.core.flag import PixelBox
 from beamline.monitor.check import AGAIN, CheckResult, Flag, Level, Logged, ScanContext, light
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame, FrameKind
+from recon.base.setting import setting
 
 CALIBRATION = 5  # frames of a kind before a verdict
 BEFORE = 3  # frames whose mean step is a line's velocity
@@ -83,12 +83,9 @@ class BandsCheck(Logged):
     unit: ClassVar[str] = "fraction of the line's light"
     meaning: ClassVar[str] = "rows or columns lost or gained light against their own past while the others did not"
 
-    alarm: Annotated[
-        float,
-        pydantic.Field(
-            ge=0, lt=1, description="fraction of light that a preview row or column may lose against the others"
-        ),
-    ] = 0.1
+    alarm: float = setting(
+        0.1, "fraction of light that a preview row or column may lose against the others", ge=0, lt=1
+    )
 
     start = BandsState
 

@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
 from beamline.monitor.change import FrameScatter, running_mean
@@ -23,6 +22,7 @@ from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues
 from drivers.base.frame import Frame, FrameKind
+from recon.base.setting import setting
 from recon.prep.overshoot import LEAST_SHARE, SEARCH, Overshoot
 
 PIXELS = 2**16  # approximate number of rows of a frame that are used
@@ -69,9 +69,7 @@ class BlurCheck(Logged):
     unit: ClassVar[str] = "share of the fine contrast"
     meaning: ClassVar[str] = "the view is less sharp than the views before"
 
-    warn: Annotated[
-        float, pydantic.Field(ge=0, lt=1, description="share of the fine contrast that a view may lose")
-    ] = 0.3
+    warn: float = setting(0.3, "share of the fine contrast that a view may lose", ge=0, lt=1)
 
     start = BlurState
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import pydantic
 
 from beamline.monitor.change import FrameScatter, SampleChange
 from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext
 from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellView, sums_of_places
 from drivers.base.frame import Frame, FrameKind
+from recon.base.setting import setting
 
 SIGMAS = 8.0
 PARTS = 5  # of the field, from left to right
@@ -34,10 +34,8 @@ class GainCheck(Logged):
     unit: ClassVar[str] = "relative change of the light"
     meaning: ClassVar[str] = "the light, or the camera's gain, stepped between this view and the one before"
 
-    warn: Annotated[
-        float, pydantic.Field(ge=0, description="relative change of the light from one view to the next")
-    ] = 0.01
-    alarm: Annotated[float, pydantic.Field(ge=0, description="relative change that is an alarm")] = 0.1
+    warn: float = setting(0.01, "relative change of the light from one view to the next", ge=0)
+    alarm: float = setting(0.1, "relative change that is an alarm", ge=0)
 
     start = FrameScatter
 
@@ -94,7 +92,7 @@ class ZingersCheck(Logged):
     unit: ClassVar[str] = "zingers over pixels"
     meaning: ClassVar[str] = "many bright spots that are in this frame only"
 
-    warn: Annotated[float, pydantic.Field(ge=0, le=1, description="zingers over pixels that a view may have")] = 1e-4
+    warn: float = setting(1e-4, "zingers over pixels that a view may have", ge=0, le=1)
 
     start = ZingersState
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import pydantic
 
 from beamline.core.flag import PixelBox
 from beamline.monitor.change import MOST_STEPS
@@ -21,6 +20,7 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.foreign.track import Octave, SampleMotion, Track, tracks_of, with_view
 from beamline.monitor.view import CellGrid
 from drivers.base.frame import Frame
+from recon.base.setting import setting
 
 OCTAVES = 4  # steps of 1, 2, 4 and 8 views
 FASTEST_RIM = 4.0  # cells a step that the rim moves: with more the sample changes wholly from step to step
@@ -80,7 +80,7 @@ class FloaterCheck(Logged):
     unit: ClassVar[str] = "standard deviations"
     meaning: ClassVar[str] = "a crumb crosses the field, on a way that nothing in the turning sample takes"
 
-    warn: Annotated[float, pydantic.Field(ge=0, description="standard deviations of the sum of a crumb's views")] = 7.0
+    warn: float = setting(7.0, "standard deviations of the sum of a crumb's views", ge=0)
 
     start = FloaterState
 

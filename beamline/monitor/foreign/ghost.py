@@ -10,10 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
 from beamline.monitor.check import CheckResult, Flag, Level, Logged, ScanContext, again_by
@@ -21,6 +20,7 @@ from beamline.monitor.digest import FrameDigest
 from beamline.monitor.view import CellValues, sums_of_places
 from drivers.base.frame import Frame
 from recon.base.arrays import median_deviation
+from recon.base.setting import setting
 
 Reals = NDArray[np.float64]
 REACH = 6  # cells of a window to either side of its middle
@@ -143,10 +143,8 @@ class GhostCheck(Logged):
         "a ghost crosses the field: a broad hump of more or less light that does not turn with the sample"
     )
 
-    warn: Annotated[
-        float, pydantic.Field(ge=0, description="relative change of the light in the middle of the ghost")
-    ] = 0.01
-    alarm: Annotated[float, pydantic.Field(ge=0, description="relative change that is an alarm")] = 0.8
+    warn: float = setting(0.01, "relative change of the light in the middle of the ghost", ge=0)
+    alarm: float = setting(0.8, "relative change that is an alarm", ge=0)
 
     start = GhostState
 

@@ -18,8 +18,9 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import DigitalOutput, StageLimits, TriggerTrain
 from drivers.epics.channel import PvValue, open_channel, refuse_invalid
-from drivers.stages.settings import StageFigures, key
+from drivers.stages.settings import StageFigures
 from drivers.stages.shared import FoundSettings, LineStage, found_at_opening, until_standing, while_it_moves
+from recon.base.setting import setting
 
 
 class Search(StrEnum):
@@ -48,10 +49,10 @@ class EpicsSettings(StageFigures):
     pulse_width: ClassVar[None] = None
     active_high: ClassVar[bool] = True
     """No cable: only checks of trigger pulses ask for it."""
-    unit: str = key("deg", "The record's EGU; a linear axis has mm, which then stands wherever a key says deg.")
-    search: Search = key(Search.NONE, "How `beamline home` finds its reference: none, HOMF or HOMR.")
-    tolerance: int = key(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
-    timeout: float = key(2.0, "For an answer of the IOC.", unit="s", gt=0)
+    unit: str = setting("deg", "The record's EGU; a linear axis has mm, which then stands wherever a key says deg.")
+    search: Search = setting(Search.NONE, "How `beamline home` finds its reference: none, HOMF or HOMR.")
+    tolerance: int = setting(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
+    timeout: float = setting(2.0, "For an answer of the IOC.", unit="s", gt=0)
 
     def limits(self) -> StageLimits:
         """See `StageSettings`."""

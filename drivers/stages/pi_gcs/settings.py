@@ -14,7 +14,8 @@ from enum import StrEnum
 from fractions import Fraction
 
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.stages.settings import StageFigures, Wiring, key
+from drivers.stages.settings import StageFigures, Wiring
+from recon.base.setting import setting
 
 PULLED_APART = Fraction(1, 10)
 """Largest error of the last pulse, in intervals, by a step that a controller rounds in its reply. Whether it also uses
@@ -105,17 +106,17 @@ class PiGcsSettings(Wiring, StageFigures):
         ValueError: a speed or acceleration that cannot be written, or a pulse width, which the firmware fixes.
     """
 
-    axis: str = key("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
-    serial: str | None = key(None, "Its serial number, as in *IDN?: another device is refused; null: any is taken.")
-    trigger_line: int = key(1, "Digital output that the trigger pulses come from.", gt=0)
-    reference: Reference = key(Reference.SWITCH, "What the search for the reference goes to.")
-    first_pulse: PiFirstPulse = key(
+    axis: str = setting("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
+    serial: str | None = setting(None, "Its serial number, as in *IDN?: another device is refused; null: any is taken.")
+    trigger_line: int = setting(1, "Digital output that the trigger pulses come from.", gt=0)
+    reference: Reference = setting(Reference.SWITCH, "What the search for the reference goes to.")
+    first_pulse: PiFirstPulse = setting(
         PiFirstPulse.AT_THRESHOLD,
         "Where the firmware puts a train's first pulse; not documented, to be found out once (docs/hardware.md).",
     )
-    firmware_pulse: float = key(50e-6, "How long the firmware holds a pulse.", unit="s", gt=0)
-    tolerance: int = key(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
-    settle: float = key(
+    firmware_pulse: float = setting(50e-6, "How long the firmware holds a pulse.", unit="s", gt=0)
+    tolerance: int = setting(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
+    settle: float = setting(
         1.0, "After a move, in which the controller may still bring the axis on target.", unit="s", ge=0
     )
 

@@ -8,8 +8,9 @@ from enum import StrEnum
 from typing import ClassVar
 
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.stages.settings import StageFigures, Wiring, key
+from drivers.stages.settings import StageFigures, Wiring
 from drivers.stages.travel import counts_in
+from recon.base.setting import setting
 
 MODES = {1e-3: 5, 100e-6: 4, 10e-6: 3, 200e-9: 2}  # Pulse width in s, the widest first -> TMGM mode
 
@@ -106,14 +107,16 @@ class PM16CSettings(Wiring, StageFigures):
 
     pulse_output: ClassVar[None] = None
     """Pulses come from TP0; no output can be set."""
-    baudrate: int = key(9600, gt=0)
-    channel: int = key(0, ge=0, le=15)
-    first_pulse: Pm16cFirstPulse = key(
+    baudrate: int = setting(9600, gt=0)
+    channel: int = setting(0, ge=0, le=15)
+    first_pulse: Pm16cFirstPulse = setting(
         Pm16cFirstPulse.AT_START,
         "Where the firmware puts a train's first pulse: at its start point (from memory), or an interval behind it.",
     )
-    home: float | None = key(None, "Where its home switch is; null: it has none, and no search is made.", unit="deg")
-    home_speed: float | None = key(None, "For the search; null: a tenth of max_speed_deg_s.", unit="deg_s", gt=0)
+    home: float | None = setting(
+        None, "Where its home switch is; null: it has none, and no search is made.", unit="deg"
+    )
+    home_speed: float | None = setting(None, "For the search; null: a tenth of max_speed_deg_s.", unit="deg_s", gt=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from drivers.base.protocols import StageLimits, TriggerTrain
-from drivers.keys import key
 from drivers.stages.settings import StageFigures, Wiring
+from recon.base.setting import setting
 
 SHORTEST = 1e-3  # Least s between two fires of a trigger [from memory: firmware checks about this often]
 SPEED_UNIT = 1.6384  # Native speed of one microstep/s; of acceleration it is a ten-thousandth for one microstep/s²
@@ -35,23 +35,25 @@ class ZaberSettings(Wiring, StageFigures):
     """
 
     stand_in: ClassVar[str] = "pi_gcs"  # its own controller is simulated in the tests
-    device: int = key(1, ge=1, le=99)
-    axis: int = key(1, ge=1, le=9)
-    serial: str | None = key(None, "Its serial number (system.serial): another device is refused; null: any is taken.")
-    output: int = key(1, "Digital output that the trigger pulses come from.", gt=0)
-    toggle: bool = key(
+    device: int = setting(1, ge=1, le=99)
+    axis: int = setting(1, ge=1, le=9)
+    serial: str | None = setting(
+        None, "Its serial number (system.serial): another device is refused; null: any is taken."
+    )
+    output: int = setting(1, "Digital output that the trigger pulses come from.", gt=0)
+    toggle: bool = setting(
         False,
         "Each fire toggles the output (firmware without `schedule`): every second one is a pulse, intervals are even.",
     )
-    speed_unit: float = key(SPEED_UNIT, "Native speed per microstep/s; the vendor's convention, from memory.", gt=0)
-    measured: bool = key(False, "Pulses by the encoder, not by the commanded position.")
-    chained: bool = key(
+    speed_unit: float = setting(SPEED_UNIT, "Native speed per microstep/s; the vendor's convention, from memory.", gt=0)
+    measured: bool = setting(False, "Pulses by the encoder, not by the commanded position.")
+    chained: bool = setting(
         True, "An action may enable another trigger; false: arming turns the stage to one step before the first pulse."
     )
-    fires_when_enabled: bool = key(False, "A distance trigger fires where it is enabled, too.")
-    starter: int = key(1, gt=0)
-    repeater: int = key(2, "The numbers of the two triggers used.", gt=0)
-    shortest: float = key(SHORTEST, "Between two fires at full speed.", unit="s", gt=0)
+    fires_when_enabled: bool = setting(False, "A distance trigger fires where it is enabled, too.")
+    starter: int = setting(1, gt=0)
+    repeater: int = setting(2, "The numbers of the two triggers used.", gt=0)
+    shortest: float = setting(SHORTEST, "Between two fires at full speed.", unit="s", gt=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from dataclasses import asdict, dataclass, replace
 from typing import ClassVar, Self
 
@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from recon import Geometry, Grid, Progress, Reconstruction, RunControl, Volume
-from recon.base.method import ReconProblem, Traits
+from recon.base.method import ReconProblem
+from recon.base.method_kinds import Iterative
+from recon.base.setting import Count, NonNegative, Positive
 from recon.splatting.initialise import first_volume
 from recon.voxels.voxel_problem import density_unit
 from splatline_neural.networks import F32, Field, HashGrid, Waves, drawn, rays_of
@@ -34,7 +36,7 @@ _TOP = 0.98  # share of the highest density that counts as reached
 
 
 @dataclass(frozen=True)
-class FieldMethod(ABC):
+class FieldMethod(Iterative):
     """Settings that all neural fields share.
 
     Attributes:
@@ -49,22 +51,22 @@ class FieldMethod(ABC):
         width: numbers of a hidden layer.
     """
 
-    name: ClassVar[str]
-    label: ClassVar[str]
-    traits: ClassVar[Traits] = Traits(device=True, needs_matter=True, halo=4)
+    takes: ClassVar[frozenset[str]] = frozenset({"device"})
+    needs_matter: ClassVar[bool] = True
+    halo: ClassVar[int] = 4
 
-    steps: int = 3000
-    seconds: float | None = None
+    steps: Count = 3000
+    seconds: NonNegative | None = None
     allow_negative: bool = False
-    rays: int = 1024
-    samples: int | None = None
-    rate: float = 1e-2
-    highest: float = 2.0
-    width: int = 32
+    rays: Count = 1024
+    samples: Count | None = None
+    rate: Positive = 1e-2
+    highest: Positive = 2.0
+    width: Count = 32
 
-    def __post_init__(self) -> None:
-        if min(self.steps, self.rays, self.rate, self.highest, self.width) <= 0:
-            raise ValueError(f"steps, rays, rate, highest and width must be above 0, got {self}")
+    @property
+    def time_limit(self) -> float | None:
+        return self.seconds
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         return fit_field(self, problem, control)

@@ -12,8 +12,8 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.decisions import Decisions
-from recon.base.declared_types import Count, Natural, NonNegative, Positive
-from recon.base.method import Traits
+from recon.base.method import Plain
+from recon.base.setting import Count, Natural, NonNegative, Positive
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import VoxelMethod
@@ -26,7 +26,6 @@ class Sirt(VoxelMethod):
 
     name: ClassVar[str] = "sirt"
     label: ClassVar[str] = "SIRT"
-    traits: ClassVar[Traits] = Traits()
     buffers: ClassVar[Buffers] = Buffers(4.5, 3.2, 3.1)
 
     iterations: Count = 100
@@ -51,7 +50,6 @@ class Sart(VoxelMethod):
 
     name: ClassVar[str] = "sart"
     label: ClassVar[str] = "SART"
-    traits: ClassVar[Traits] = Traits()
     buffers: ClassVar[Buffers] = Buffers(3.5, 6.6, 4.1)
 
     iterations: Count = 20
@@ -78,11 +76,15 @@ class Cgls(VoxelMethod):
 
     name: ClassVar[str] = "cgls"
     label: ClassVar[str] = "CGLS"
-    traits: ClassVar[Traits] = Traits(own_length=True)
     buffers: ClassVar[Buffers] = Buffers(3.1, 4.5, 4.1)
 
     iterations: Count = 10
     allow_negative: bool = False
+
+    @classmethod
+    def ended_by(cls, seconds: float) -> dict[str, Plain]:
+        """None: more iterations come no nearer."""
+        return {}
 
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         projector = problem.projector
@@ -129,7 +131,7 @@ class AsdPocs(VoxelMethod):
 
     name: ClassVar[str] = "asd-pocs"
     label: ClassVar[str] = "ASD-POCS"
-    traits: ClassVar[Traits] = Traits(halo=8)
+    halo: ClassVar[int] = 8
     buffers: ClassVar[Buffers] = Buffers(5.1, 7.8, 4.1, filtered=True)
 
     iterations: Count = 10

@@ -10,9 +10,10 @@ from typing import Annotated, Any, ClassVar, Self
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.declared_types import Bound, Checked, Count, NonNegative
 from recon.base.geometry import Geometry
-from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import Progress, ReconProblem, Reconstruction, RunControl
+from recon.base.method_kinds import Series
+from recon.base.setting import Count, NonNegative, Setting
 from recon.base.volume import Grid, Volume, VolumeSeries
 from recon.features.joint.series import LEAST_VIEWS, SWEEPS, TimedViews, fit_series
 
@@ -21,7 +22,7 @@ _COPIES = 6  # of all line integrals: lines, a part held out, moments, binned vi
 
 
 @dataclass(frozen=True)
-class TimeSeries(Checked):
+class TimeSeries(Series):
     """Volumes at evenly spaced times from one scan of a changing sample, see `fit_series`.
 
     Attributes:
@@ -36,9 +37,9 @@ class TimeSeries(Checked):
 
     name: ClassVar[str] = "series"
     label: ClassVar[str] = "Volumes in time"
-    traits: ClassVar[Traits] = Traits(in_time=True, least_views=LEAST_VIEWS)
+    least_views: ClassVar[int] = LEAST_VIEWS
 
-    volumes: Annotated[int, Bound(2)] = 2
+    volumes: Annotated[int, Setting(ge=2)] = 2
     moves: bool | None = None
     sweeps: Count = SWEEPS
     weight: NonNegative | None = None

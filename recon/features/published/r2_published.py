@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 from recon.base.choices import Start
 from recon.base.kernel import Kernel, Truncation
-from recon.base.method import Traits
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.r2 import R2
 from recon.splatting.settings import DensityPolicy, FitSettings
@@ -38,8 +37,7 @@ class R2Published(R2):
 
     name: ClassVar[str] = "r2-published"
     label: ClassVar[str] = "R²-Gaussian as published"
-
-    traits: ClassVar[Traits] = replace(R2.traits, error_bars=None)
+    error_bars: ClassVar[tuple[float, float] | None] = None
 
     steps: int | None = _STEPS
     gaussians: int | Gaussians | None = 50_000

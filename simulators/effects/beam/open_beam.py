@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
+from recon.base.setting import setting
 from simulators.effects.chain import VISIBLE, Anomaly, ImageEffect, Label, Views, lit_share, within
 from simulators.frame.mapping import BelowOne, NotNegative, Positive, Whole
 from simulators.frame.shot import Image, Shot
@@ -60,7 +59,7 @@ class RingCurrent(ImageEffect):
 
     lifetime: Positive
     top_up_every: Positive | None = None
-    top_up_below: Annotated[float, Field(gt=0, lt=1)] | None = None
+    top_up_below: float | None = setting(None, gt=0, lt=1)
     refill: NotNegative = 0.0
 
     def __post_init__(self) -> None:
@@ -165,7 +164,7 @@ class Ghost(ImageEffect, Anomaly):
     view: Whole
     width: Positive
     speed: Positive
-    gain: Annotated[float, Field(ge=-1)] = 0.3
+    gain: float = setting(0.3, ge=-1)
 
     def __post_init__(self) -> None:
         if self.gain == 0:

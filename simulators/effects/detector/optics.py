@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.optimize import brentq
 
 from drivers.orca_quest import SENSOR_SHAPE
 from recon.base.jit import njit
+from recon.base.setting import setting
 from simulators.effects.chain import ImageEffect, SamplingEffect
 from simulators.frame.mapping import BelowOne, NotNegative, Positive, Whole
 from simulators.frame.shot import CannotExposeError, Image, Moments, Shot, fixed_rng
@@ -139,13 +139,13 @@ class FlatStructure(ImageEffect):
         seed: of places, sizes and depths.
     """
 
-    specks: Annotated[int, Field(ge=0, le=100_000)] = 200
+    specks: int = setting(200, ge=0, le=100_000)
     radius_um: Positive = 10.0
-    depth: Annotated[float, Field(ge=0, le=0.5)] = 0.1
-    scratches: Annotated[int, Field(ge=0, le=1000)] = 5
+    depth: float = setting(0.1, ge=0, le=0.5)
+    scratches: int = setting(5, ge=0, le=1000)
     scratch_length_um: Positive = 2000.0
     scratch_width_um: Positive = 3.0
-    scratch_depth: Annotated[float, Field(ge=0, le=0.5)] = 0.05
+    scratch_depth: float = setting(0.05, ge=0, le=0.5)
     seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
@@ -238,7 +238,7 @@ class Afterglow(SamplingEffect):
 
     shares: tuple[NotNegative, ...]
     decay_times: tuple[Positive, ...]
-    samples: Annotated[int, Field(ge=1, le=32)] = 3
+    samples: int = setting(3, ge=1, le=32)
 
     def __post_init__(self) -> None:
         if not self.shares or len(self.shares) != len(self.decay_times):

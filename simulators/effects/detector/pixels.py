@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
-from pydantic import Field
 
+from recon.base.setting import setting
 from simulators.effects.chain import ImageEffect, SamplingEffect
 from simulators.frame.mapping import NotNegative, Positive, Share, Whole
 from simulators.frame.shot import CannotExposeError, Image, Moments, Shot, frame_rng
@@ -26,7 +25,7 @@ class Prnu(ImageEffect):
         seed: of the pixels' responses.
     """
 
-    spread: Annotated[float, Field(ge=0, le=0.2)] = 0.01
+    spread: float = setting(0.01, ge=0, le=0.2)
     seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
@@ -48,8 +47,8 @@ class HotPixels(ImageEffect):
         seed: of their places and dark currents.
     """
 
-    fraction: Annotated[float, Field(ge=0, le=0.1)] = 1e-4
-    rate: Annotated[float, Field(ge=0, le=1e9)] = 2000.0
+    fraction: float = setting(1e-4, ge=0, le=0.1)
+    rate: float = setting(2000.0, ge=0, le=1e9)
     seed: Whole = 0
 
     def apply(self, image: Image, shot: Shot) -> Image:
@@ -70,7 +69,7 @@ class DeadPixels(ImageEffect):
         seed: of their places.
     """
 
-    fraction: Annotated[float, Field(ge=0, le=0.1)] = 1e-4
+    fraction: float = setting(1e-4, ge=0, le=0.1)
     charge: NotNegative = 0.0
     seed: Whole = 0
 

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
 
+from recon.base.setting import Setting, setting
 from simulators.effects.chain import VISIBLE, Anomaly, ImageEffect, Label, Views, within
 from simulators.frame.mapping import NotNegative, Positive, Whole
 from simulators.frame.shot import Image, Shot, fixed_rng
 from simulators.pixels.broad_blur import add_enlarged, broad_blur, gaussian
 
-Length = Annotated[float, Field(ge=1e-9, le=1e9)]
-Height = Annotated[float, Field(ge=-1e9, le=1e9)]
+Length = Annotated[float, Setting(ge=1e-9, le=1e9)]
+Height = Annotated[float, Setting(ge=-1e9, le=1e9)]
 """mm. With larger values, more crumbs or deeper ones a frame takes seconds or overflows."""
 
 
@@ -69,9 +69,9 @@ class Floaters(ImageEffect, Anomaly):
     """
 
     distance: tuple[Length, Length]
-    count: Annotated[int, Field(ge=1, le=10_000)] = 3
+    count: int = setting(3, ge=1, le=10_000)
     size: tuple[Length, Length] = (0.01, 0.03)
-    depth: Annotated[float, Field(ge=4 * VISIBLE, le=1e6)] = 0.5
+    depth: float = setting(0.5, ge=4 * VISIBLE, le=1e6)
     heights: tuple[Height, Height] = (-0.2, 0.2)
     motion: Literal["turning", "loose"] = "turning"
     speed: Length = 0.05

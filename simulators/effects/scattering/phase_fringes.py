@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy import fft
 
 from recon.base.jit import njit, thread_count
+from recon.base.setting import setting
 from simulators.effects.chain import ImageEffect
 from simulators.frame.mapping import NotNegative, Positive
 from simulators.frame.shot import CannotExposeError, Detector, Image, Shot
@@ -58,7 +58,7 @@ class PhaseFringes(ImageEffect):
     delta_beta: NotNegative
     distance: NotNegative
     energy: Positive
-    oversampling: Annotated[int, Field(ge=1, le=8)] = 1
+    oversampling: int = setting(1, ge=1, le=8)
     method: Literal["wave", "transport"] = "wave"
 
     def __post_init__(self) -> None:

@@ -17,16 +17,17 @@ from typing import Annotated
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from pydantic import Field
+
+from recon.base.setting import Setting
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 ORIGIN: Vector = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (1.0, 0.0, 0.0, 0.0)
 LEAST, MOST = 1e-9, 1e9  # mm: with far larger lengths, squares and quotients in the kernels overflow
-Millimetres = Annotated[float, Field(ge=LEAST, le=MOST)]
-Micrometres = Annotated[float, Field(ge=1e3 * LEAST, le=1e3 * MOST)]
-Gap = Annotated[float, Field(ge=0, le=1e3 * MOST)]  # um
+Millimetres = Annotated[float, Setting(ge=LEAST, le=MOST)]
+Micrometres = Annotated[float, Setting(ge=1e3 * LEAST, le=1e3 * MOST)]
+Gap = Annotated[float, Setting(ge=0, le=1e3 * MOST)]  # um
 DENSEST = 1e12  # 1/mm: with far larger ones, sums over chords overflow
 FLAT = 1e-9  # Share of a body's size: corners closer than this to a plane count as in it
 

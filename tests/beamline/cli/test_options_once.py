@@ -15,8 +15,7 @@ from beamline.cli.options import declared
 from beamline.cli.recon import recon
 from beamline.projections.selection import Selection
 from beamline.reconstruct.options import ReconOptions
-from recon.base.method import Traits
-from recon.methods import taking
+from recon.methods import accepting, taking
 
 OPTIONS = declared(recon)
 TYPED = {
@@ -30,7 +29,7 @@ TYPED = {
 """A value of each option that has a rule; "" of a flag."""
 PAIRS = [(name, other) for name, param in OPTIONS.items() for other in param.excludes if other != SLABS_RESUMED]
 LACKING = [name for name, param in OPTIONS.items() if param.needs is not None]
-OF_METHODS = [name for name, param in OPTIONS.items() if (param.setting or param.trait) and not param.needs]
+OF_METHODS = [name for name, param in OPTIONS.items() if (param.setting or param.argument) and not param.needs]
 GOLDEN = Path(__file__).with_name("refusals.json")
 REFUSALS: dict[str, str] = json.loads(GOLDEN.read_text(encoding="utf-8")) if GOLDEN.is_file() else {}
 
@@ -67,7 +66,7 @@ def test_the_name_of_the_last_version_is_understood_and_not_shown(name: str) -> 
 def test_a_rule_names_what_is_there(name: str) -> None:
     param = OPTIONS[name]
     assert not param.setting or taking(param.setting)
-    assert not param.trait or param.trait in {each.name for each in fields(Traits)}
+    assert not param.argument or accepting(param.argument) or param.argument == "budget"
     assert set(param.excludes) | ({param.needs[0]} if param.needs else set()) <= {*OPTIONS, SLABS_RESUMED}
 
 

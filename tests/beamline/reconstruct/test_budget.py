@@ -19,7 +19,7 @@ from drivers.base.clock import SystemClock
 from recon.assess.time_model import PRESETS
 from recon.auto import Auto
 from recon.base.geometry import Geometry
-from recon.base.method import Method, candidates_of
+from recon.base.method import Method
 from recon.base.volume import Grid
 from recon.forecast import Forecast, Timing
 from recon.splatting.r2 import R2
@@ -35,7 +35,7 @@ SECONDS = {"fbp": 1.0, "fista-tv": 10.0, "pnp-dct": 30.0, "r2": 20.0}
 
 def expected(self: Timing, method: Method) -> Forecast:
     """All are tried for a half of what they take, then the slowest may be run."""
-    taken = [SECONDS[each.name] for each in candidates_of(method)]
+    taken = [SECONDS[each.name] for each in method.alternatives]
     return Forecast(sum(taken) / 2 if len(taken) > 1 else 0.0, {method.name: max(taken)})
 
 
@@ -56,7 +56,7 @@ def test_the_slowest_is_left_out_until_the_choice_ends_in_time(
     monkeypatch.setattr(Timing, "of", expected)
     views, warned = Geometry.parallel(np.linspace(0, 3, 20), (4, 16)), list[str]()
     method, words = in_budget(Auto(), budget, views, Grid.matching(views), SteppedClock(0.0, 0.0), warned.append)
-    assert [each.name for each in candidates_of(method)] == left
+    assert [each.name for each in method.alternatives] == left
     assert [f"about {0.5 * late:.3g} s late" in said for said in warned] == [True] * late
     assert all((f"{name} would take about" in words) == (name not in left) for name in SECONDS)
     assert words.startswith(f"{budget:.3g} s for {' or '.join(left)}")
@@ -64,7 +64,7 @@ def test_the_slowest_is_left_out_until_the_choice_ends_in_time(
 
 def test_what_does_not_take_the_views_is_no_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuses(self: Timing, method: Method) -> Forecast:
-        if any(isinstance(each, Fbp) for each in candidates_of(method)):
+        if any(isinstance(each, Fbp) for each in method.alternatives):
             raise ValueError("no direct method")
         return expected(self, method)
 

@@ -20,7 +20,6 @@ from beamline.reconstruct.run import fit_within
 from beamline.storage.readers.open import SourceOptions
 from drivers.base.clock import SystemClock
 from recon.base.geometry import Geometry
-from recon.base.method import setting
 from recon.splatting.r2 import R2
 from tests.beamline.prepared_views import prepared_views
 from tests.beamline.scans import TwoCylinders, write_exchange
@@ -43,7 +42,8 @@ def _within(seconds: float, spent: float, report: bool = True) -> tuple[float, f
     method, before_report = fit_within(
         R2(seconds=seconds), seconds, _prepared(), target, started, SteppedClock(100.0 + spent), said.append
     )
-    return float(setting(method, "seconds")), 100.0 + seconds - before_report.deadline, said
+    assert method.time_limit is not None
+    return method.time_limit, 100.0 + seconds - before_report.deadline, said
 
 
 def test_a_fit_gets_the_time_that_reading_measuring_and_writing_leave() -> None:

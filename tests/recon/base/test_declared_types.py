@@ -16,18 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 
 import recon
 from recon.base.declared_types import (
-    Bound,
     Checked,
-    Count,
-    Natural,
-    NonNegative,
-    Positive,
     is_of_type,
     refusal,
     types_of,
 )
 from recon.base.kernel import Kernel
 from recon.base.method import Method
+from recon.base.setting import Count, Natural, NonNegative, Positive, Setting
 from recon.base.volume import Grid
 from recon.methods import METHODS, by_name
 
@@ -40,7 +36,7 @@ NO_VALUES = {"AxisEstimate", "Kernel", "Materials", "Progress", "Projections", "
 @dataclass(frozen=True)
 class Some(Checked):
     steps: Natural | None = None
-    level: Annotated[int, Bound(1, 16)] = 3
+    level: Annotated[int, Setting(ge=1, le=16)] = 3
     weight: NonNegative = 0.0
     rate: Positive | None = None
     start: Literal["fbp", "tv"] = "fbp"

@@ -73,12 +73,12 @@ def test_slabs_that_follow_fit_together(method: Method, rng: np.random.Generator
     decide = Decisions(3)
     whole = recon.reconstruct(views, geometry, method, control=RunControl(decide=decide)).volume.data
     found = np.zeros_like(whole)
-    for slab in slabs_of(60, 24, method.traits.halo):
+    for slab in slabs_of(60, 24, method.halo):
         rows, part, box = part_of(geometry, grid, slab.slices)
         control = RunControl(decide=Decisions(3, decide.made))
         volume = recon.reconstruct(views[:, rows], part, method, grid=box, control=control).volume.data
         found[slab.slices] += slab.share[:, None, None] * volume
-    assert np.abs(found - whole).max() < (1e-3 if method.traits.halo else 1e-6) * whole.max()
+    assert np.abs(found - whole).max() < (1e-3 if method.halo else 1e-6) * whole.max()
 
 
 @pytest.mark.slow
@@ -96,7 +96,7 @@ def test_fits_of_slabs_fit_together_within_the_noise() -> None:
     method = recon.R2(steps=80, gaussians=2000)
     whole, again = (recon.reconstruct(p, geometry, method).volume.data for p in (one, other))
     scatter, found, decide = rms(whole - again), np.zeros_like(whole), Decisions()
-    for slab in slabs_of(48, 24, recon.R2.traits.halo):
+    for slab in slabs_of(48, 24, recon.R2.halo):
         rows, part, box = part_of(geometry, grid, slab.slices)
         decide = Decisions(0, decide.made)
         method = replace(method, gaussians=round(2000 * box.shape[0] / 48))

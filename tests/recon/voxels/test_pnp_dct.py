@@ -98,7 +98,7 @@ def test_slabs_that_follow_fit_together(rng: np.random.Generator) -> None:
     decide, method = Decisions(3), recon.PnpDct()
     whole = recon.reconstruct(views, geometry, method, control=RunControl(decide=decide)).volume.data
     found = np.zeros_like(whole)
-    for slab in slabs_of(60, 24, method.traits.halo):
+    for slab in slabs_of(60, 24, method.halo):
         rows, part, box = part_of(geometry, grid, slab.slices)
         control = RunControl(decide=Decisions(3, decide.made))
         volume = recon.reconstruct(views[:, rows], part, method, grid=box, control=control).volume.data

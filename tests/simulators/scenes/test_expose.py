@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numba
@@ -161,15 +162,15 @@ def test_what_cannot_be_is_refused() -> None:
     for changes, words in (
         ({"detector": {"shape": [2400, 100]}}, "do not lie on the sensor of 2304 x 4096"),
         ({"detector": {"shape": [1200, 100], "binning": 2}}, "do not lie on the sensor"),
-        ({"detector": {"binning": 3}}, "binning must be 1, 2 or 4, got 3"),
-        ({"detector": {"electrons_per_count": 0}}, "electrons_per_count must be greater than 0"),
-        ({"detector": {"exposure_s": 0}}, "exposure_s must be greater than 0"),
-        ({"detector": {"readout": "fast"}}, "readout must be 'standard', 'ultra_quiet' or 'photon_number', got 'fast'"),
-        ({"scan": {"views": 0}}, "views must be greater than or equal to 1, got 0"),
-        ({"scan": {"flats": 10**7}}, "flats must be less than or equal to 1000000"),
-        ({"scan": {"range_deg": -1e9}}, "range_deg must be greater than or equal to -1000000"),
-        ({"scan": {"period_s": 1e308}}, "period_s must be less than or equal to 1000000"),
-        ({"detector": {"pixel_size_um": 1e-308}}, "pixel_size_um must be greater than or equal to 0.001"),
+        ({"detector": {"binning": 3}}, "binning is 3; expected 1 | 2 | 4"),
+        ({"detector": {"electrons_per_count": 0}}, "electrons_per_count is 0; expected a number > 0"),
+        ({"detector": {"exposure_s": 0}}, "exposure_s is 0; expected a number > 0"),
+        ({"detector": {"readout": "fast"}}, "readout is 'fast'; expected standard | ultra_quiet | photon_number"),
+        ({"scan": {"views": 0}}, "views is 0; expected a whole number >= 1"),
+        ({"scan": {"flats": 10**7}}, "flats is 10000000; expected a whole number >= 0 and <= 1e+06"),
+        ({"scan": {"range_deg": -1e9}}, "range_deg is -1000000000.0; expected a number >= -1e+06"),
+        ({"scan": {"period_s": 1e308}}, "period_s is 1e+308; expected a number > 0 and <= 1e+06"),
+        ({"detector": {"pixel_size_um": 1e-308}}, "pixel_size_um is 1e-308; expected a number >= 0.001"),
     ):
-        with pytest.raises(SceneError, match=words):
+        with pytest.raises(SceneError, match=re.escape(words)):
             _scan(**changes)

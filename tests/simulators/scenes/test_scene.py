@@ -76,19 +76,22 @@ def _with(**changes: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("mapping", "words"),
     [
-        ({}, "scene: key 'phantom' is missing"),
+        ({}, "scene.phantom is missing; expected any value"),
         (
             _with(colour="red"),
-            "scene: key 'colour' is unknown; legal: phantom, beam, axis_offset_px, effects",
+            "scene.colour is not a known key; legal keys there: phantom, beam, axis_offset_px, effects",
         ),
-        (_with(beam={"photons": 1}), "scene.beam: key 'photons' is unknown; legal: photons_per_s, sod, sdd"),
-        (_with(beam=5), "scene.beam must be a mapping with the keys photons_per_s, sod, sdd, energy_kev"),
+        (
+            _with(beam={"photons": 1}),
+            "scene.beam.photons is not a known key (did you mean photons_per_s?)",
+        ),
+        (_with(beam=5), "scene.beam is 5; expected a group of keys: photons_per_s, sod, sdd, energy_kev"),
         (_with(phantom={"kind": "teapot"}), "scene.phantom: kind 'teapot' is unknown; legal: battery, solids"),
         (
             _with(phantom={"kind": "battery", "field_of_view": [1, 1], "fill": 0.9}),
             "scene.phantom (battery): only",
         ),
-        (_with(phantom={"kind": "solids"}), "scene.phantom (solids): key 'solids' is missing"),
+        (_with(phantom={"kind": "solids"}), "scene.phantom (solids).solids is missing; expected a list of"),
         (
             _with(phantom={"kind": "solids", "solids": [{"kind": "cone"}]}),
             "scene.phantom (solids).solids[0]: kind 'cone' is unknown; legal: cylinder, ellipsoid, box",
@@ -97,11 +100,11 @@ def _with(**changes: Any) -> dict[str, Any]:
             _with(phantom={"kind": "solids", "solids": [{"kind": "box", "edges": [1, 1, 0], "attenuation": 1}]}),
             "scene.phantom (solids).solids[0] (box): box: edges must be positive",
         ),
-        (_with(effects="offset"), "scene.effects must be a list, got 'offset'"),
+        (_with(effects="offset"), "scene.effects is 'offset'; expected a list of 0 or more: any value | null"),
         (_with(effects=["fog"]), "scene.effects[0]: kind 'fog' is unknown; legal: motion_blur, rolling_shutter, "),
         (
             _with(effects=["photon_noise", {"kind": "zingers", "rat": 1}]),
-            "scene.effects[1] (zingers): key 'rat' is unknown; legal: rate, charge",
+            "scene.effects[1] (zingers).rat is not a known key (did you mean rate?); legal keys there: rate, charge",
         ),
         (
             _with(effects=["offset", "photon_noise"]),

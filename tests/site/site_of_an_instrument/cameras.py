@@ -9,13 +9,13 @@ import numpy as np
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
-from drivers.stages.settings import key
+from recon.base.setting import setting
 
 
 @dataclass(frozen=True)
 class SiteCameraSettings:
-    readout: float = key(2e-3, "Of a frame.", unit="s", gt=0)
-    offset: int = key(100, "Counts without light.", ge=0)
+    readout: float = setting(2e-3, "Of a frame.", unit="s", gt=0)
+    offset: int = setting(100, "Counts without light.", ge=0)
 
 
 class SiteCamera:

@@ -9,18 +9,18 @@ import numpy as np
 
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
-from recon.base.method import ReconProblem, Reconstruction, RunControl, Traits
+from recon.base.method import ReconProblem, Reconstruction, RunControl
+from recon.base.method_kinds import Direct
 from recon.base.volume import Grid, Volume
 from recon.voxels.direct import direct
 
 
 @dataclass(frozen=True)
-class Mean:
+class Mean(Direct):
     """The mean of filtered back-projections by two filters."""
 
     name: ClassVar[str] = "mean"
     label: ClassVar[str] = "Mean of two"
-    traits: ClassVar[Traits] = Traits(direct=True)
     share: float = 0.5
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:

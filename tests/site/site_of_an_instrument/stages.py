@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 from drivers.stages.pi_gcs.settings import PiGcsSettings
 from drivers.stages.pi_gcs.stage import PiGcsStage
-from drivers.stages.settings import key
+from recon.base.setting import setting
 
 
 @dataclass(frozen=True)
 class SiteStageSettings(PiGcsSettings):
     """The site's stage: a PI with a brake."""
 
-    brake: float = key(0.1, "How long its brake takes.", unit="s", ge=0)
+    brake: float = setting(0.1, "How long its brake takes.", unit="s", ge=0)
 
 
 class SiteStage(PiGcsStage):

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field, PositiveInt
-
 from beamline.config.beam import BeamMonitorSection
-from beamline.config.section import Port, without
+from beamline.config.section import Port
 from drivers.base.clock import Clock
 from drivers.beam_monitors import (
     PATTERN,
@@ -22,9 +20,10 @@ from drivers.beam_monitors import (
 )
 from drivers.epics.channel import url_problem as pv_problem
 from drivers.epics.devices import PvSource
+from recon.base.setting import Setting, setting
 
-Pattern = Annotated[str, without(pattern_problem)]
-PvUrl = Annotated[str, without(pv_problem)]
+Pattern = Annotated[str, Setting(problem=pattern_problem)]
+PvUrl = Annotated[str, Setting(problem=pv_problem)]
 
 
 class ElectrometerConfig(BeamMonitorSection):
@@ -33,14 +32,14 @@ class ElectrometerConfig(BeamMonitorSection):
     counterpart: ClassVar[str | None] = "electrometer"
 
     kind: Literal["electrometer"]
-    port: Port = Field(description="A serial port, socket://host:port, or sim://electrometer.")
-    query: Annotated[str, Field(min_length=1)] = QUERY
-    pattern: Pattern = Field(default=PATTERN, description="Regular expression whose first group is the number.")
+    port: Port = setting(doc="A serial port, socket://host:port, or sim://electrometer.")
+    query: str = setting(QUERY, min_length=1)
+    pattern: Pattern = setting(PATTERN, "Regular expression whose first group is the number.")
     unit: str = "A"
-    setup: tuple[str, ...] = Field(default=(), description="Commands without a reply, sent once at the start.")
+    setup: tuple[str, ...] = setting((), "Commands without a reply, sent once at the start.")
     line_end: Literal["crlf", "cr", "lf"] = "crlf"
-    baudrate: PositiveInt = 9600
-    transcript: str | None = Field(default=None, description="As the stage's.")
+    baudrate: int = setting(9600, gt=0)
+    transcript: str | None = setting(None, "As the stage's.")
 
     @property
     def simulated(self) -> bool:
@@ -67,8 +66,8 @@ class RingCurrentConfig(BeamMonitorSection):
     """The ring current from a page or a text file."""
 
     kind: Literal["ring_current"]
-    url: Annotated[str, without(url_problem)] = Field(description="http://..., https://... or file:///...")
-    pattern: Pattern = Field(description="Regular expression whose first group is the number.")
+    url: Annotated[str, Setting(problem=url_problem)] = setting(doc="http://..., https://... or file:///...")
+    pattern: Pattern = setting(doc="Regular expression whose first group is the number.")
     unit: str = "mA"
 
     def connect(self, clock: Clock, url: str | None = None) -> TextBeamMonitor:
@@ -80,7 +79,7 @@ class EpicsBeamConfig(BeamMonitorSection):
     """The ring current, or an intensity, from an EPICS process variable."""
 
     kind: Literal["epics"]
-    pv: PvUrl = Field(description="pva://NAME or ca://NAME.")
+    pv: PvUrl = setting(doc="pva://NAME or ca://NAME.")
     unit: str = "mA"
 
     def connect(self, clock: Clock, url: str | None = None) -> TextBeamMonitor:

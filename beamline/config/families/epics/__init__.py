@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from beamline.config.beam import FoundFilter, FoundMonochromator, FoundShutter, Name, refuse_equal
 from beamline.config.section import declared, read_from, section_of
@@ -17,6 +17,7 @@ from drivers.epics.devices import (
     PvShutter,
     ShutterPvs,
 )
+from recon.base.setting import setting
 
 _KIND = {"kind": (Literal["epics"], ...)}
 
@@ -32,7 +33,7 @@ class EpicsShutter(section_of("EpicsShutterKeys", FoundShutter, declared(Shutter
 class EpicsFilter(section_of("EpicsFilterKeys", FoundFilter, _KIND | declared(FilterPvs))):  # type: ignore[misc]
     """Filters behind EPICS process variables, each as pva://NAME or ca://NAME."""
 
-    places: Annotated[dict[Name, float | str], Field(min_length=1)] = Field(description="Name: value.")
+    places: dict[Name, float | str] = setting(doc="Name: value.", min_length=1)
 
     @model_validator(mode="after")
     def _one_value_a_place(self) -> Self:

@@ -9,8 +9,8 @@ from types import MappingProxyType
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 
+from recon.base.setting import Setting, setting
 from simulators.frame.mapping import BelowOne, NotNegative, Positive, Share
 from simulators.samples.bodies.solids import (
     Cylinder,
@@ -190,9 +190,9 @@ class Cathode(PieceBuilder):
     height: Positive = 0.5
     wall_um: Positive = 20.0
     size_um: Micrometres = 25.0
-    spread: Annotated[float, Field(ge=0, le=2)] = 0.25
-    fill: Annotated[float, Field(ge=0, lt=0.64)] = 0.4
-    habits: Mapping[Habit, Annotated[float, Field(ge=0, le=1e9)]] = field(
+    spread: float = setting(0.25, ge=0, le=2)
+    fill: float = setting(0.4, ge=0, lt=0.64)
+    habits: Mapping[Habit, Annotated[float, Setting(ge=0, le=1e9)]] = field(
         default_factory=lambda: MappingProxyType(
             {"octahedron": 0.4, "truncated_octahedron": 0.25, "ellipsoid": 0.2, "plate": 0.15}
         )

@@ -11,13 +11,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from recon.base.jit import njit
+from recon.base.setting import setting
 from simulators.samples.bodies.solids import Box, Cylinder, Ellipsoid, Gap, Micrometres, Millimetres
 from simulators.samples.builders.packed.pieces import Piece, PieceBuilder, check_roles
 
@@ -46,11 +46,11 @@ class Foam(PieceBuilder):
     diameter: Millimetres = 0.6
     height: Millimetres = 0.5
     edges: tuple[Millimetres, Millimetres, Millimetres] | None = None
-    n_holes: Annotated[int, Field(ge=0, le=200_000)] = 1000
+    n_holes: int = setting(1000, ge=0, le=200_000)
     largest_um: Micrometres = 60.0
     smallest_um: Micrometres = 5.0
     gap_um: Gap = 1.0
-    candidates: Annotated[int, Field(ge=1, le=10_000_000)] = 200_000
+    candidates: int = setting(200_000, ge=1, le=10_000_000)
     seed: int = 0
 
     default_materials: ClassVar[Mapping[str, str]] = MADE_OF

@@ -10,9 +10,9 @@ from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
-from pydantic import Field
 
 from recon.base.registry import unknown
+from recon.base.setting import Setting, setting
 from simulators.frame.mapping import SceneError, build, choose, located
 from simulators.light import Beam
 from simulators.samples.bodies.phantom import Phantom
@@ -65,8 +65,8 @@ def check_roles(settings: PieceBuilder) -> None:
             raise ValueError(f"{key}: {unknown('part of this phantom', others[0], roles)}")
 
 
-_Seconds = Annotated[float, Field(ge=0, le=1e6)]
-_Over = Annotated[float, Field(gt=0, le=1e6)]
+_Seconds = Annotated[float, Setting(ge=0, le=1e6)]
+_Over = Annotated[float, Setting(gt=0, le=1e6)]
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Settle:
         over_s: s, time constant.
     """
 
-    share: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    share: float = setting(0.2, gt=0, lt=1)
     from_s: _Seconds = 0.0
     over_s: _Over = 10.0
 
@@ -134,7 +134,7 @@ class Charge:
     """
 
     role: str = "particle"
-    factor: Annotated[float, Field(gt=0, le=100)] = 0.5
+    factor: float = setting(0.5, gt=0, le=100)
     from_s: _Seconds = 0.0
     over_s: _Over = 10.0
     each_s: _Over = 1.0

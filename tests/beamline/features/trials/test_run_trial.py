@@ -93,7 +93,7 @@ def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> N
 
 @pytest.mark.parametrize(
     "method",
-    [name for name in names_of_one_volume() if not by_name(name).traits.direct],
+    [name for name in names_of_one_volume() if by_name(name).fitted],
 )
 def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) -> None:
     """On a clock that goes on by a tenth of a second whenever it is asked."""
@@ -101,7 +101,7 @@ def test_a_trial_with_a_time_ends_when_it_is_over(data: TrialData, method: str) 
     trial = MethodTrial("method", method, 27, seconds_asked=8.0)
     alone = replace(data, prepared=replace(data.prepared, held_out=None))
     found = run(trial, alone, RunControl(now=lambda: 0.1 * next(ticks)))
-    own_length = by_name(method).traits.own_length
+    own_length = not by_name(method).ended_by(8.0)
     assert (0 if own_length else 0.6 * 8) < found.seconds < 1.1 * 8
     assert np.isfinite(found.metrics["psnr"])
 

@@ -78,11 +78,11 @@ def test_thresholds_and_labels_are_of_the_files_values() -> None:
     ("changed", "message"),
     [
         ({"axes": "zyy"}, "axes must name x, y and z"),
-        ({"voxel_mm": -1.0}, "voxel_mm must be greater than 0"),
+        ({"voxel_mm": -1.0}, "voxel_mm is -1.0; expected a number > 0"),
         ({"window": [3.0, 3.0], "scale": 1.0}, r"window must be \(low, high\)"),
         ({"window": [3.0, 4.0]}, "a window needs attenuation_max"),
         ({"scale": 1.0, "attenuation_max": 2.0}, "scale and attenuation_max exclude each other"),
-        ({"file": 7}, "file must be text"),
+        ({"file": 7}, "file is 7; expected text"),
         ({"thresholds": [3.0, 2.0]}, "thresholds must ascend"),
         ({"voxel_mm": None}, "voxel_mm is missing"),
         ({"file": "flat"}, "three axes"),

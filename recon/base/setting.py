@@ -1,0 +1,146 @@
+"""Setting: the declaration of a value, beside its type and its default: its meaning, unit and legal range.
+
+    exposure: Annotated[float, Setting("Of a view.", unit="s", gt=0, le=1e6)] = 0.1
+
+Fields of methods, of drivers' settings, of checks, of a scene and of a configuration are declared so, and arguments of
+functions. `recon.base.declared_types` and `CheckedSettings` refuse other values; pydantic reads a file by them, and
+makes its schema.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import operator
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from numbers import Real
+from typing import Annotated, Any
+
+_FACTORS = {**dict.fromkeys(("deg", "deg_s", "deg_s2"), math.radians(1)), "mb": 1e6}
+"""Units of a configuration whose values are in radians or bytes inside -> that of 1."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a field or an argument declares of its value.
+
+    Attributes:
+        default: in the unit of a configuration; `...`, or MISSING of dataclasses: it must be given.
+        doc: its meaning, if the name does not tell.
+        unit: in which a configuration writes it, which ends the name of its key; "" without one. Bounds are in it.
+        gt, ge, lt, le: bounds of a number, which is finite.
+        min_length, max_length: of a text or a list.
+        pattern: of a text.
+        problem: says what is wrong with a value; "" where nothing is. None: nothing can be.
+    """
+
+    doc: str = ""
+    default: Any = ...
+    unit: str = ""
+    gt: float | None = None
+    ge: float | None = None
+    lt: float | None = None
+    le: float | None = None
+    min_length: int | None = None
+    max_length: int | None = None
+    pattern: str | None = None
+    problem: Callable[[Any], str] | None = None
+
+    @property
+    def bounds(self) -> Mapping[str, Any]:
+        """The bounds that there are, by name."""
+        return {name: bound for name in _WITHIN if (bound := getattr(self, name)) is not None}
+
+    @property
+    def words(self) -> str:
+        """The bounds of a number in a sentence."""
+        if self.ge is not None and self.le is not None:
+            return f"from {self.ge:g} to {self.le:g}"
+        return f"above {self.gt:g}" if self.gt is not None else f"of {self.ge:g} or more"
+
+    def fault(self, value: Any) -> str:
+        """What is wrong with the value of a field; "" where nothing is."""
+        if isinstance(value, Real) and not -math.inf < float(value) < math.inf:
+            return "expected a finite number"
+        if value is None:
+            return ""
+        bounds = {name: self.inside(bound) for name, bound in self.bounds.items()}
+        if not all(_WITHIN[name](value, bound) for name, bound in bounds.items()):
+            return f"expected {' and '.join(f'{_WORDS[name]} {bound}' for name, bound in bounds.items())}"
+        return "" if self.problem is None else self.problem(value)
+
+    def key_of(self, field: str) -> str:
+        """The key by which a configuration writes a field."""
+        return f"{field}_{self.unit}" if self.unit else field
+
+    def inside(self, value: Any) -> Any:
+        """A value of a configuration in the unit of the field."""
+        if value is None or self.unit not in _FACTORS:
+            return value
+        return value * 1_000_000 if self.unit == "mb" else math.radians(value)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Callable[[Any], Any]) -> Any:
+        """The schema of the type with these bounds, also where it may be None."""
+        schema = handler(source)
+        (schema["schema"] if schema["type"] == "nullable" else schema).update(self.bounds)
+        if self.problem is None:
+            return schema
+        from pydantic_core import core_schema  # here: only who reads a file needs it
+
+        return core_schema.no_info_after_validator_function(self._checked, schema)
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Callable[[Any], Any]) -> Any:
+        return handler(schema) | ({"description": self.doc} if self.doc else {})
+
+    def _checked(self, value: Any) -> Any:
+        if value is not None and self.problem is not None and (problem := self.problem(value)):
+            raise ValueError(problem)
+        return value
+
+
+_WITHIN: Mapping[str, Callable[[Any, Any], Any]] = {
+    "gt": operator.gt,
+    "ge": operator.ge,
+    "lt": operator.lt,
+    "le": operator.le,
+    "min_length": lambda value, least: len(value) >= least,
+    "max_length": lambda value, most: len(value) <= most,
+    "pattern": lambda text, pattern: re.fullmatch(pattern, text),
+}
+_WORDS = {
+    "gt": ">", "ge": ">=", "lt": "<", "le": "<=", "min_length": "a length of at least",
+    "max_length": "a length of at most", "pattern": "text of the form",
+}  # fmt: skip
+_SETTING = "setting"  # the key of the metadata of a field
+
+Natural = Annotated[int, Setting(ge=0)]
+Count = Annotated[int, Setting(ge=1)]
+NonNegative = Annotated[float, Setting(ge=0)]
+Positive = Annotated[float, Setting(gt=0)]
+
+
+def setting(default: Any = ..., doc: str = "", **rest: Any) -> Any:
+    """The field of a dataclass, or of a section of a configuration, that declares its value; `rest` as of `Setting`."""
+    made = Setting(doc, default, **rest)
+    inside = dataclasses.MISSING if default is ... else made.inside(default)
+    return dataclasses.field(default=inside, metadata={_SETTING: made, "description": doc or None, **made.bounds})
+
+
+def settings_of(owner: Any) -> Mapping[str, Setting]:
+    """What the fields of a dataclass declare, by name."""
+    return {each.name: each.metadata.get(_SETTING, Setting(default=each.default)) for each in dataclasses.fields(owner)}
+
+
+class CheckedSettings:
+    """Settings, as a dataclass, whose fields are within the bounds that they declare.
+
+    Raises:
+        ValueError: one is not.
+    """
+
+    def __post_init__(self) -> None:
+        for name, declared in settings_of(self).items():
+            if fault := declared.fault(value := getattr(self, name)):
+                raise ValueError(f"{type(self).__name__}.{name} is {value!r}: {fault}")
