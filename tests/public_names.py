@@ -45,7 +45,7 @@ FOR_PACKAGES = {
     "recon.base.method": ("Method", "ReconProblem"),
     "recon.base.method_kinds": ("Direct", "Iterative", "Series"),
     "recon.base.masks": ("masked",),
-    "recon.base.setting": ("Setting", "setting"),
+    "recon.base.setting": ("Count", "NonNegative", "Positive", "Setting", "setting"),
     "recon.base.view_data": ("Views",),
     "recon.splatting.initialise": ("first_volume",),
     "recon.voxels.voxel_problem": ("density_unit",),

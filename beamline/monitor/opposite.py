@@ -52,7 +52,7 @@ class Kept:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class ViewFit:
     """The fit of a view to another: its shift across and down, with the standard deviation `sigma` by noise, and the
     remainder as a shift; all in pixels. `places`: sum of squares of the shares that the places of single views have in
     the shift. `unsure`: by how many pixels the extrapolation of the kept view may err by itself, without any motion; 0
@@ -146,7 +146,7 @@ class OppositeCheck(Logged):
         return replace(looked, state=replace(looked.state, kept=(*state.kept[:at], one, *state.kept[at + 1 :])))
 
     def _unsure(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
-        """Largest likely error, px, of a kept view extrapolated by some steps, see `Fit.unsure`.
+        """Largest likely error, px, of a kept view extrapolated by some steps, see `ViewFit.unsure`.
 
         A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
         differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that
@@ -167,7 +167,7 @@ class OppositeCheck(Logged):
         return unsure * (unsure > max(self.changed, CELLS[1] * grid.cell))
 
     def _mirrored(
-        self, state: OppositeState, one: Kept, fit: Fit, view: CellView, context: ScanContext
+        self, state: OppositeState, one: Kept, fit: ViewFit, view: CellView, context: ScanContext
     ) -> CheckResult[OppositeState]:
         assert context.grid is not None
         cell, cols = context.grid.cell, context.grid.shape[1]
@@ -189,7 +189,7 @@ class OppositeCheck(Logged):
         )
         return CheckResult(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
 
-    def _moved(self, fit: Fit, row: int, other: str, context: ScanContext) -> Flag | None:
+    def _moved(self, fit: ViewFit, row: int, other: str, context: ScanContext) -> Flag | None:
         assert context.grid is not None
         moved, cell = math.hypot(fit.across, fit.down), context.grid.cell
         # The first pair, which gave the axis, had views beside the sample's way, too.
@@ -232,7 +232,7 @@ def _folded(angle: float) -> float:
     return math.remainder(angle, 2 * math.pi)
 
 
-def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> Fit | None:
+def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> ViewFit | None:
     """Best fit of the kept view to a view some steps later; None if the view has too little structure.
 
     Least squares over light, shift across and shift down, from the best whole number of cells on.
@@ -280,7 +280,7 @@ def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored:
     # Both views begin at `first`: mirrored about the frame's middle their columns are elsewhere.
     off = first + last - grid.shape[1] if mirrored else 0
     places = 1 + (1 - steps) ** 2 + steps**2
-    return Fit((across + off) * grid.cell, down * grid.cell, remainder * grid.cell, sigma * grid.cell, places)
+    return ViewFit((across + off) * grid.cell, down * grid.cell, remainder * grid.cell, sigma * grid.cell, places)
 
 
 def _nearest(before: Reals, now: Reals) -> int:
