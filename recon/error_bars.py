@@ -164,7 +164,7 @@ def _refitted(
     def told(iteration: int, residual: float) -> bool:
         nonlocal done, stopped
         done += 1
-        control.tell_part(done, 2 * sweeps, begin, problem.geometry.n_views, "sweeps of error bars")
+        control.report_progress(done, 2 * sweeps, begin, problem.geometry.n_views, "sweeps of error bars")
         stopped = stopped or control.stop()
         return stopped
 

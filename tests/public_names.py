@@ -31,7 +31,7 @@ FOR_PACKAGES = {
     "beamline.cli.options": ("as_scan", "json_option", "parsed", "volume_argument", "volume_path"),
     "beamline.cli.terminal": ("Answer", "answering"),
     "beamline.core.errors": ("BeamlineError", "ConfigError", "DataError", "QualityError", "user_message"),
-    "beamline.core.files": ("refuse_existing", "text_in", "whole_file", "write_together", "write_whole"),
+    "beamline.core.files": ("refuse_existing", "text_in", "atomic_file", "write_together", "write_whole"),
     "beamline.core.text": ("csv_text", "safe_name", "size"),
     "beamline.core.quantities": ("VoxelKind",),
     "beamline.gaussians": ("Model", "read_model"),

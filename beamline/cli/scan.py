@@ -326,11 +326,11 @@ def faults_of(result: RunResult) -> list[str]:
 def _treated(path: Path) -> str:
     """How a reconstruction will treat flagged views, as a sentence; "" if the file does not say."""
     from beamline.storage.readers.open import open_scan
-    from beamline.storage.rules.treatment import treatment_of
+    from beamline.storage.rules.flag_policy import flag_policy
 
     with suppress(DataError), open_scan(path) as source:
         views = source.table.are_views
-        return "" if source.table.flags is None else treatment_of(source.table.flags, views, source.shape).in_words
+        return "" if source.table.flags is None else flag_policy(source.table.flags, views, source.shape).in_words
     return ""
 
 

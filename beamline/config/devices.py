@@ -28,6 +28,7 @@ from drivers import orca_quest
 from drivers.base.clock import Clock
 from drivers.base.protocols import Camera, CameraSettings, CameraTiming
 from drivers.orca_quest import DcamOptions
+from drivers.stages.settings import with_settings
 from recon.base.registry import Registry, in_folders
 from recon.base.setting import Setting, setting
 
@@ -49,7 +50,7 @@ class CameraDriver(Protocol):
         """The camera's timing, before it is connected. Raises ValueError for settings that it would refuse."""
 
 
-CAMERAS: Registry[CameraDriver] = Registry("camera", {}, reserved=("dcam", "simulated_orca"))
+CAMERAS: Registry[CameraDriver] = Registry("camera", {}, with_settings, reserved=("dcam", "simulated_orca"))
 """Kind in a configuration -> the driver."""
 
 

@@ -20,7 +20,7 @@ from beamline.config.section import Port, Section, declared, read_from, section_
 from beamline.core.machine import state_folder
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage
-from drivers.stages.settings import StageDriver, StageSettings
+from drivers.stages.settings import StageDriver, StageSettings, with_settings
 from drivers.stages.shared import LineStage
 from recon.base.registry import Registry, in_folders
 from recon.base.setting import setting
@@ -31,6 +31,7 @@ STAGES: Registry[StageDriver] = Registry(
         kind: getattr(import_module(f"drivers.stages.{kind}.stage"), name)
         for kind, name in in_folders("drivers.stages", "DRIVERS").items()
     },
+    with_settings,
 )
 """Kind, as a configuration names it -> the driver."""
 

@@ -267,7 +267,7 @@ def bring_to_disk(path: Path) -> None:
 
 
 @contextmanager
-def whole_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
+def atomic_file(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """A context with a temporary name beside `path`, for a file or a folder. At its end that is flushed to the disk and
     renamed to `path`; an error removes it. Leftovers of a killed program for the same `path` are removed first.
 
@@ -320,10 +320,10 @@ def _remove_left(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str, *, replace: bool = False) -> None:
-    """Write a file from memory as `whole_file` does, and verify it by reading it back. Raises DataError if it
+    """Write a file from memory as `atomic_file` does, and verify it by reading it back. Raises DataError if it
     differs."""
     data = content.encode() if isinstance(content, str) else content
-    with whole_file(path, replace=replace) as partial:
+    with atomic_file(path, replace=replace) as partial:
         partial.write_bytes(data)
         bring_to_disk(partial)
         if partial.read_bytes() != data:

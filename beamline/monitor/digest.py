@@ -19,7 +19,7 @@ from zlib_ng import zlib_ng
 from recon.base.jit import njit
 
 ENTROPY_BINS = 256
-ENOUGH = 128  # blocks per side that suffice for a check; a large preview is thinned to about so many
+ENOUGH = 128  # blocks per side that suffice for a check; a large preview is subsampled to about so many
 LARGEST = 1e15  # of a pixel, either sign: float32 holds the squares of such numbers, and sums of them over a frame
 SMALL, LARGE = 4, 8  # pixels a side of the blocks that the checks see; large ones where ENOUGH of them remain
 ENTROPY_PIXELS = 2**20  # about: of the counts of larger frames every k-th row is enough for the entropy
@@ -71,7 +71,7 @@ def block_side(shape: tuple[int, ...], preview: tuple[int, ...]) -> int:
     return max(round(n / blocks) for n, blocks in zip(shape, preview, strict=True))
 
 
-def thinned(preview: NDArray[np.float32]) -> NDArray[np.float32]:
+def subsampled(preview: NDArray[np.float32]) -> NDArray[np.float32]:
     """Every k-th block along both axes, so that a large frame costs no more than a small one."""
     step_rows, step_cols = (max(1, n // ENOUGH) for n in preview.shape)
     return preview[::step_rows, ::step_cols]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.monitor.digest import FrameDigest, thinned
+from beamline.monitor.digest import FrameDigest, subsampled
 from drivers.base.frame import FrameKind
 from recon.base.arrays import F32, Mask
 from recon.base.noise import deviation_between_frames, deviation_between_neighbours
@@ -51,7 +51,7 @@ class FrameStatistics:
     @classmethod
     def of(cls, row: int, kind: FrameKind, exposure: float, digest: FrameDigest, block: int) -> FrameStatistics:
         """The frame of a running scan, by its digest."""
-        return cls(row, kind, exposure, digest.saturated_fraction, np.array(thinned(digest.preview)), block)
+        return cls(row, kind, exposure, digest.saturated_fraction, np.array(subsampled(digest.preview)), block)
 
     @property
     def seconds(self) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.monitor.check import AGAIN, CheckResult, Flag, Level, Logged, Policy, ScanContext
-from beamline.monitor.digest import FrameDigest, thinned
+from beamline.monitor.digest import FrameDigest, subsampled
 from drivers.base.frame import Frame, FrameKind
 from recon.base.setting import setting
 
@@ -186,7 +186,7 @@ class DarkCheck(Logged):
     def look(self, state: DarkState, frame: Frame, digest: FrameDigest, context: ScanContext) -> CheckResult[DarkState]:
         if frame.kind is not FrameKind.DARK:
             return CheckResult(state)
-        blocks = thinned(digest.preview)
+        blocks = subsampled(digest.preview)
         if state.blocks is None:
             return CheckResult(DarkState(blocks))
         drift = _trimmed_mean(blocks - state.blocks)

@@ -18,7 +18,7 @@ from beamline.projections.selection import ScanSelection
 from beamline.projections.tilt import MATTERS, tilt_text
 from beamline.projections.views import refuse
 from beamline.storage.rules.evidence import ScanEvidence
-from beamline.storage.rules.light import WARN, light_beside_flats
+from beamline.storage.rules.light import WARN, check_air_level
 from recon.base.arrays import F32, F64, median_deviation
 from recon.base.geometry import Geometry
 from recon.base.noise import NOISE_VIEWS, noise_level
@@ -162,7 +162,7 @@ def compare_with_flats(
         ]
         level = float(np.median(columns, axis=0).min())
     air = any(projections.air_columns)
-    for finding in light_beside_flats(scan, level, air, scan.asked.accepted or said or not refused):
+    for finding in check_air_level(scan, level, air, scan.asked.accepted or said or not refused):
         refuse(scan.source, [finding])
         warn(finding.message)
     return {"air beside the flats": f"{level:+.3f} of line integral (tolerance {WARN:g})"} if air else {}

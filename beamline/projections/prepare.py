@@ -18,7 +18,7 @@ from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.poses import ScanPoses, poses_of, require_stated
 from beamline.projections.corrections.resampling import TiltAndLens, with_tilt
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.protocols import EstimatedStep, ScanStep
+from beamline.projections.protocols import EstimatedStep, ScanStep, ViewStep
 from beamline.projections.read import NoViewError, ViewFilters
 from beamline.projections.registry import geometry_steps, in_order
 from beamline.projections.scan_warnings import (
@@ -63,7 +63,7 @@ def prepare_projections(
     selection: Selection,
     warn: Warn,
     buffer: DiskBuffer | None = None,
-    check: Callable[[Geometry], object] | None = None,
+    check: Callable[[Geometry], object] = lambda geometry: None,
     phases: Phases | None = None,
 ) -> PreparedProjections:
     """Read, correct and align the views of `selection`.
@@ -72,10 +72,9 @@ def prepare_projections(
         source: a finished scan.
         selection: what to use.
         warn: takes a sentence on everything that is not as it should be though work goes on.
-        buffer: on disk, takes the line integrals; None: they stay in memory. Rays that were not measured, or weigh
-            nothing by the flags, are interpolated there, and `shares` is None.
-        check: raises what is wrong with the geometry of the views, as soon as the axis is known: before they are
-            corrected.
+        buffer: takes the line integrals on disk, with rays that were not measured or weigh nothing by the flags
+            interpolated, and no `shares`; None: they stay in memory.
+        check: raises what is wrong with the geometry of the views, before these are corrected.
         phases: takes the name of each phase as it begins.
 
     Raises:
@@ -100,18 +99,12 @@ def prepare_projections(
     usable = view_geometry.find_motion(usable, warn, phases)
     used, others = _chosen(view_geometry, usable, poses)
     view_geometry.calibrate(np.union1d(used, others), phases)
-    if check is not None:
-        check(view_geometry.of(used))
+    check(view_geometry.of(used))
     phases.enter("correction")
     used = np.union1d(used, wide) if buffer is None else used
     projections = _corrected(source, correction, used, buffer, phases)
     geometry = view_geometry.of(projections.view_ids)
-    if estimated := [
-        new
-        for step in in_order(selection)
-        if isinstance(step, EstimatedStep)
-        and (new := step.estimated(source, selection, projections, geometry)) is not None
-    ]:
+    if estimated := _estimated(source, selection, projections, geometry):
         selection = selection.with_steps(*estimated)
         correction = ScanCorrection(scan, selection, lambda _: None, usable.frames)  # its warnings were given
         if any(step.on(source, selection)[0] is not None for step in estimated):
@@ -124,8 +117,17 @@ def prepare_projections(
     tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
     prepared = replace(prepared, done={**correction.plan.done, **tilt, **view_geometry.done})
     prepared = _after_scan_steps(source, selection, prepared, phases)
-    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.ordinary, selection, warn)})
+    prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.centred, selection, warn)})
     return prepared if buffer is None else _with_unknown_filled(prepared)
+
+
+def _estimated(
+    source: ScanSource, selection: ScanSelection, projections: Projections, geometry: Geometry
+) -> list[ViewStep]:
+    """The steps whose settings follow from the corrected views, with these settings."""
+    steps = [step for step in in_order(selection) if isinstance(step, EstimatedStep)]
+    found = [step.estimated(source, selection, projections, geometry) for step in steps]
+    return [step for step in found if step is not None]
 
 
 def _with_held_out(
@@ -259,7 +261,6 @@ def assemble(
         raise DataError(f"{source.path}: only {ids.size} of the chosen views can be used; at least 2 are needed.")
     if not projections.data.any():
         raise DataError(f"{source.path}: the chosen views are zero everywhere: there is no sample in the beam.")
-    axis_col, estimate = axis
     unknown, resampling = projections.masked, selection.step(TiltAndLens).of(source, selection)
     if resampling is not None:
         unknown = unknown | resampling.unseen((height, width), rows.start)
@@ -273,8 +274,8 @@ def assemble(
     prepared = PreparedProjections(
         projections=projections,
         geometry=geometry,
-        axis_col=axis_col,
-        axis=estimate,
+        axis_col=axis[0],
+        axis=axis[1],
         held_out=None,
         n_projections=source.table.views.size,
         length_unit="px" if selection.pixel_size_mm is None else "mm",
@@ -289,7 +290,7 @@ def assemble(
         sample_radius=None if selection.sample_width is None else selection.sample_width / 2,
     )
     report_defects(prepared, first, binning, warn)
-    warn_of_the_field(scan, selection, prepared.ordinary, warn)
+    warn_of_the_field(scan, selection, prepared.centred, warn)
     return prepared
 
 

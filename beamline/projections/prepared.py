@@ -122,9 +122,9 @@ class PreparedProjections:
         )
 
     @property
-    def ordinary(self) -> PreparedProjections:
+    def centred(self) -> PreparedProjections:
         """The same views without wide ones, which show the sample more than half a field beside its usual place."""
-        return self.wanted(self.geometry.ordinary)
+        return self.wanted(self.geometry.is_centred)
 
     def wanted(self, views: NDArray[np.bool_]) -> PreparedProjections:
         """The same views without those that are not wanted, [view]."""

@@ -58,7 +58,7 @@ def warn_of_the_field(scan: ScanEvidence, selection: ScanSelection, prepared: Pr
         if unlevelled and scan.in_counts and selection.step(Air).model != "none":
             light = without_air(scan, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
-        wide = not geometry.ordinary.all() or bool(scan.table.wide_views.size)
+        wide = not geometry.is_centred.all() or bool(scan.table.wide_views.size)
         warn(f"{cut_sentence(sides, continued, wide)} {light}".rstrip())
         if unlevelled and (change := uncorrected_current(scan, selection)):
             warn(change)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from beamline.storage.flag_legend import FrameFlags
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.rules.evidence import ScanEvidence
-    from beamline.storage.rules.treatment import Treatment
+    from beamline.storage.rules.flag_policy import FlagPolicy
     from recon.prep.resample import Resampling
 
 
@@ -127,7 +127,7 @@ views are missing."""
 
 def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
     """Projections without an alarm and their weights; all with equal weights if `use_flags` is False."""
-    from beamline.storage.rules.treatment import treatment_of
+    from beamline.storage.rules.flag_policy import flag_policy
 
     views, flags = scan.table.are_views, scan.flags
     rows = np.flatnonzero(views)
@@ -138,7 +138,7 @@ def usable_views(scan: ScanEvidence, use_flags: bool) -> UsableViews:
         n = f"{count(int(alarmed.sum()), 'view')} with an alarm and {warned.sum()} with a warning"
         sentence = f"--flags ignore: {n} are used as they are."
         return UsableViews(scan, rows, sentence=sentence, flags=flags)
-    treated = treatment_of(flags, views, scan.source.shape)
+    treated = flag_policy(flags, views, scan.source.shape)
     if not treated.in_words:
         return UsableViews(scan, rows, flags=flags, jumps=treated.jumps)
     weights = np.where(treated.halved, np.float32(WARNED_WEIGHT), np.float32(1)) if treated.halved.any() else None
@@ -164,7 +164,7 @@ def _widest_gap(angles: NDArray[np.float64], period: float) -> float:
     return period if sorted_angles.size == 0 else float(np.diff(sorted_angles, append=sorted_angles[0] + period).max())
 
 
-def regions_of(treated: Treatment) -> Regions:
+def regions_of(treated: FlagPolicy) -> Regions:
     """The regions of warnings and alarms in frames; rays in an alarm region have weight 0."""
     frames, boxes, alarms = zip(*treated.parts, strict=True) if treated.parts else ((), (), ())
     shares = np.where(np.array(alarms, np.bool_), np.float32(0), np.float32(WARNED_SHARE))

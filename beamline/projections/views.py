@@ -24,9 +24,9 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.transforms import WRAPPED
 from beamline.storage.rules import Finding, angles_shown
 from beamline.storage.rules.evidence import EvidenceRequest, ScanEvidence
+from beamline.storage.rules.flag_policy import FLAGS
 from beamline.storage.rules.scan import VARYING, findings_of
 from beamline.storage.rules.stored_order import SINOGRAM
-from beamline.storage.rules.treatment import FLAGS
 from recon.base.geometry import Geometry
 
 

@@ -383,7 +383,7 @@ class ScanFollower:
                     continue
                 if done[step.name].sentence:
                     self._tell({step.name: done[step.name]})
-                    self._fit.replace_views(prepared.ordinary.projections.measured)
+                    self._fit.replace_views(prepared.centred.projections.measured)
         return replace(prepared, done=done)
 
     def _tell(self, done: Mapping[str, StepDone]) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from beamline.config.tree import override, read
 from beamline.core.errors import ConfigError
-from beamline.core.files import SETTINGS, text_in, whole_file
+from beamline.core.files import SETTINGS, atomic_file, text_in
 from beamline.core.installed import shipped_scenes
 from beamline.core.quantities import VoxelKind
 from beamline.simulate import volumes_beside
@@ -147,7 +147,7 @@ def write_truth(path: Path, truth: Truth) -> None:
     Raises:
         DataError: `path` exists or cannot be written.
     """
-    with whole_file(path) as partial, hdf5.created(partial) as file:
+    with atomic_file(path) as partial, hdf5.created(partial) as file:
         data = new_plot(file, "data", truth.grid, "mm")
         chunks = (1, *truth.grid.shape[1:])
         data.create_dataset("data", data=truth.values, chunks=chunks)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.event_lines import LARGEST_LOG, LONGEST
-from beamline.core.files import EVENTS, JOINED, SCAN, open_below, parts_of, run_of, whole_file
+from beamline.core.files import EVENTS, JOINED, SCAN, atomic_file, open_below, parts_of, run_of
 from beamline.core.process import json_object
 from beamline.monitor.digest import has_checksum
 from beamline.storage import datasets, hdf5
@@ -112,7 +112,7 @@ def join(parts: Sequence[Path], joined: Path) -> int:
     for part in parts:  # HDF5 draws nothing from a file that is marked as being written
         if (head := superblock(part)) is not None and head.open_for_writing:
             raise DataError(f"{joined} could not be made: {part} was not closed. The parts are untouched.")
-    with whole_file(joined, replace=True) as partial, ExitStack() as opened:
+    with atomic_file(joined, replace=True) as partial, ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         try:
             with hdf5.created(partial, layout.LIBVER) as file:

@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
-from beamline.core.files import no_file, refuse_existing, run_of, whole_file
+from beamline.core.files import atomic_file, no_file, refuse_existing, run_of
 from beamline.core.text import count, size, spans
 from beamline.storage import hdf5
 from beamline.storage.disk_file import GrowingFile
@@ -115,7 +115,7 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
             )
         free = size(shutil.disk_usage(path.parent).free)
         say(f"{path}: its frames are copied, which takes up to {size(head.size)} on its disk; {free} are free.")
-        with whole_file(path, replace=True) as partial:
+        with atomic_file(path, replace=True) as partial:
             done = _copied(path, head, partial)
             if done.lost or done.damaged:
                 done = replace(done, remark=_kept_aside(path))

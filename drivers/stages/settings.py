@@ -13,10 +13,16 @@ from typing import Any, ClassVar, Protocol
 
 from drivers.base.clock import Clock
 from drivers.base.protocols import RotationStage, StageLimits
-from recon.base.setting import CheckedSettings, setting
+from recon.base.setting import CheckedSettings, setting, settings_of
 
 FARTHEST = 1e9  # rad
 MOST = 2.0**53  # counts: the largest whole numbers that a float holds exactly
+
+
+def with_settings(name: str, driver: Any) -> Any:
+    """Another package's driver. AttributeError, TypeError: it has no dataclass of settings."""
+    settings_of(driver.Settings)
+    return driver
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -225,11 +225,11 @@ class Geometry:
     def is_off_middle(self) -> bool:
         """Whether the axis stands off the detector's middle by more than a twentieth of its width: a wide field."""
         cols = self.detector_shape[1]
-        axis = (self.axis_col + self.offsets[:, 0])[self.ordinary]
+        axis = (self.axis_col + self.offsets[:, 0])[self.is_centred]
         return abs(float(axis.mean()) - (cols - 1) / 2) > _OFF_MIDDLE * cols
 
     @property
-    def ordinary(self) -> NDArray[np.bool_]:
+    def is_centred(self) -> NDArray[np.bool_]:
         """[view] which views are no wide views: those show the sample stepped aside by more than half a field."""
         aside = self.shifts[:, 0]
         usual = np.sort(aside)[(aside.size - 1) // 2]
@@ -267,7 +267,7 @@ class Geometry:
 
         Rolled views count as straight ones, wide views do not. For a wide cone the value is limited to 0.7 sod.
         """
-        cols, axis = self.detector_shape[1], (self.axis_col + self.offsets[:, 0])[self.ordinary]
+        cols, axis = self.detector_shape[1], (self.axis_col + self.offsets[:, 0])[self.is_centred]
         reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch
         return float(min(reach, _SHORT_OF_SOURCE * self.source_distance))
 

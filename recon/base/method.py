@@ -148,7 +148,7 @@ class RunControl(Checked):
         if self.on_progress is not None:
             self.on_progress(progress)
 
-    def tell_part(self, step: int, steps: int, begin: float, n_views: int, unit: str) -> None:
+    def report_progress(self, step: int, steps: int, begin: float, n_views: int, unit: str) -> None:
         """Report progress without a residual: of a direct method, or of a part of the work that began at `begin`."""
         if self.on_progress is not None:
             self.on_progress(Progress(step, steps, self.now() - begin, math.nan, math.nan, 0, n_views, unit=unit))

@@ -23,8 +23,8 @@ class Direct(Method):
     makes_boxes: ClassVar[bool] = True
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
-        """All but wide views, see `Geometry.ordinary`."""
-        return geometry.ordinary
+        """All but wide views, see `Geometry.is_centred`."""
+        return geometry.is_centred
 
 
 class Iterative(Method):

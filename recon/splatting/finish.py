@@ -151,7 +151,7 @@ def finish(
     def on_sweep(number: int, residual: float) -> bool:
         nonlocal made
         made = number
-        control.tell_part(number, method.planned, begin, n_views, "sweeps on voxels")
+        control.report_progress(number, method.planned, begin, n_views, "sweeps on voxels")
         return control.stop()
 
     refined = solve(

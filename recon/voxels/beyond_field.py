@@ -104,14 +104,14 @@ def sample_radius(views: Views, given: float | SampleRadius | None = None) -> Sa
         given: mm, the radius where that is known.
     """
     geometry = views.geometry
-    own, reach = geometry.ordinary, geometry.reach
+    own, reach = geometry.is_centred, geometry.reach
     if given is not None:
         return _given_radius(given, reach)
     used = np.flatnonzero(own)
     some = np.union1d(spread_views(geometry.angles[used], _VIEWS, used), np.flatnonzero(~own))
     if (measured := _some_rows(views, some)) is None:
         return None
-    ordinary = measured.select(np.flatnonzero(measured.geometry.ordinary))
+    ordinary = measured.select(np.flatnonzero(measured.geometry.is_centred))
     if not wider_than_field(ordinary.data, ordinary.geometry):
         return None
     if ordinary.geometry.n_views < LEAST_VIEWS:

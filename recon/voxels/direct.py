@@ -315,7 +315,7 @@ class Fbp(Direct):
         begin, views = control.now(), problem.geometry.n_views
 
         def progress(done: int, slices: int) -> None:
-            control.tell_part(done, slices, begin, views, "slices")
+            control.report_progress(done, slices, begin, views, "slices")
 
         data = direct(filled, problem.geometry, problem.grid, self.filter, progress, device=problem.device)
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
@@ -347,7 +347,7 @@ def direct(
     """FBP of a parallel beam, FDK of a cone [z, y, x], both along the rays of rolled and tilted views; see `fbp`, `fdk`
     and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU. Wide views have no
     part."""
-    if not (own := geometry.ordinary).all():
+    if not (own := geometry.is_centred).all():
         projections, geometry = projections[own], geometry.select(np.flatnonzero(own))
     if not geometry.is_straight or (geometry.is_cone and device != "cpu"):
         return posed_direct(projections, geometry, grid, filter, on_block, device)

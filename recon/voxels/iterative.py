@@ -83,7 +83,7 @@ class TrialWatch:
         self._done += 1
         most = max(self._done, round(MOST_TRIALS * self._usual))
         of, words = (self._usual, "as a rule") if self._done <= self._usual else (most, "at most")
-        self._control.tell_part(self._done, of, self._begin, self._n_views, f"{SWEEPS_OF_TRIALS} {words}")
+        self._control.report_progress(self._done, of, self._begin, self._n_views, f"{SWEEPS_OF_TRIALS} {words}")
         return False
 
 

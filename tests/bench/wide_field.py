@@ -123,7 +123,7 @@ def main() -> None:
     for over, seed in ((float(o), int(s)) for o in given.over.split(",") for s in given.seeds.split(",")):
         geometry = geometry_of(given.columns, given.rows, given.views, given.wide_views, over)
         made = scene(seed, over, given.columns, given.rows, geometry)
-        ordinary = np.flatnonzero(geometry.ordinary)
+        ordinary = np.flatnonzero(geometry.is_centred)
         axis = recon.find_axis(made.views[ordinary], geometry.angles[ordinary])
         known = Projector(geometry, recon.Grid.matching(geometry)).forward(made.truth) + made.views - made.clean
         for name in ("known", *given.methods.split(",")):

@@ -20,7 +20,7 @@ from beamline.core.durations import in_turn
 from beamline.core.errors import DataError, QualityError, ScanStopped
 from beamline.core.event_lines import event_of
 from beamline.core.events import Done, Failed, Sink, StateEntered, Warned
-from beamline.core.files import JOINED, RECON, SCAN, whole_file, write_table
+from beamline.core.files import JOINED, RECON, SCAN, atomic_file, write_table
 from beamline.core.process import ProcessEnd, json_object, run_to_end
 from beamline.core.text import SENTENCE, count, one_line, printable, safe_name
 from beamline.storage.writer_lock import WriterLock
@@ -126,7 +126,7 @@ def names_of(scans: Sequence[Path], earlier: Sequence[BatchRow] = ()) -> list[st
 def _begin(folder: Path, recipe: bytes) -> None:
     """Make the folder. Raises DataError for one that is not that of a batch by this recipe."""
     if not folder.exists():
-        with whole_file(folder) as partial:
+        with atomic_file(folder) as partial:
             partial.mkdir()
             (partial / RECIPE).write_bytes(recipe)
             _write(partial, [])
@@ -179,7 +179,7 @@ def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Cloc
             message="made by a call that ended before it wrote this row; the report has the warnings",
         )  # fmt: skip
     try:
-        with whole_file(place) as work:
+        with atomic_file(place) as work:
             work.mkdir()
             log = work / "stderr.txt"
             call = [*COMMAND, "recon", row.scan, *how, "--output", str(work / RECON), "--beside-scan", "--json"]

@@ -24,7 +24,7 @@ from beamline.cli.options import (
 from beamline.cli.recipe import Repeatable, names_given
 from beamline.cli.terminal import answering
 from beamline.core.errors import ConfigError, DataError
-from beamline.core.files import refuse_existing, whole_file
+from beamline.core.files import atomic_file, refuse_existing
 from beamline.core.text import count, size
 from beamline.storage.volumes import suffixes_text
 from recon.base.views import spread
@@ -191,7 +191,7 @@ def _write_ply(path: Path, model: Model) -> None:
         *(f"property float {name}" for name in names),
         "end_header",
     ]
-    with whole_file(path) as partial, partial.open("wb") as file:
+    with atomic_file(path) as partial, partial.open("wb") as file:
         file.write(("\n".join(head) + "\n").encode())
         file.write(rows.tobytes())
 

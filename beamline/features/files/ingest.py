@@ -16,7 +16,7 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.events import json_of
-from beamline.core.files import whole_file
+from beamline.core.files import atomic_file
 from beamline.monitor.digest import digest
 from beamline.storage import hdf5
 from beamline.storage.flag_legend import UNMARKED
@@ -65,7 +65,7 @@ def ingest(
         DataError: unreadable input, `out` exists, or the disk does not take it. No half file is left.
     """
     out = Path(out)
-    with whole_file(out) as partial, open_scan(scan) as source:
+    with atomic_file(out) as partial, open_scan(scan) as source:
         ending = _ending_of(source)
         _refuse_what_a_copy_would_not_state(source)
         distance = source.attributes.get("distance_mm")

@@ -15,7 +15,7 @@ from matplotlib.colors import ListedColormap
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_existing, whole_file, write_together, write_whole
+from beamline.core.files import atomic_file, refuse_existing, write_together, write_whole
 from beamline.core.installed import version
 from beamline.core.text import count, csv_text
 from beamline.report.figures import WIDTH, draw_slice, finish, new_figure, planes, png
@@ -249,7 +249,7 @@ def settings_of(found: Segmented, options: SegmentOptions) -> Mapping[str, Any]:
 
 
 def _write_labels(found: Segmented, options: SegmentOptions, output: Path) -> None:
-    with whole_file(output) as new, hdf5.created(new) as file:
+    with atomic_file(output) as new, hdf5.created(new) as file:
         data = new_plot(file, "labels", found.volume.grid, found.unit)
         process = data.parent.create_group("process")
         process.attrs["NX_class"] = "NXprocess"

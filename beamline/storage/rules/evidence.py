@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.flag import Finding
-from beamline.monitor.digest import block_means, check_block, is_valid, thinned
+from beamline.monitor.digest import block_means, check_block, is_valid, subsampled
 from beamline.monitor.evidence import BRIGHT, DRIFT, LEAST_NOISE, Evidence, FrameStatistics, full_scale, lit_places
 from beamline.monitor.references import ReferenceLimits, judge
 from beamline.storage.flag_legend import FrameFlags
@@ -314,7 +314,7 @@ def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
     blocks, cells = (block_means(image, side) for side in (block, max(1, image.shape[1] // CELLS)))
     invalid = 0.0 if image.dtype == np.uint16 else 1 - float(np.mean(is_valid(image)))
     kind, rounding = FrameKind.INVALID, LEAST_NOISE * counts
-    return FrameStatistics(row, kind, np.nan, saturated, np.array(thinned(blocks)), block, rounding, invalid, cells)
+    return FrameStatistics(row, kind, np.nan, saturated, np.array(subsampled(blocks)), block, rounding, invalid, cells)
 
 
 def brightness(view: F32, dark: F32, flat: F32) -> float:

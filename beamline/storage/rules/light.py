@@ -90,7 +90,7 @@ def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
     )
 
 
-def light_beside_flats(scan: ScanEvidence, level: float, air: bool, accepted: bool = False) -> Iterator[Finding]:
+def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool = False) -> Iterator[Finding]:
     """The air of views is as bright as their flats, apart from the usual drift of a beam during a scan.
 
     Args:

@@ -18,6 +18,7 @@ from beamline.storage.rules import Finding, Severity
 from beamline.storage.rules.angles import angles_spread, angles_unknown
 from beamline.storage.rules.angles_shown import angles_shown
 from beamline.storage.rules.evidence import ScanEvidence
+from beamline.storage.rules.flag_policy import frames_flagged
 from beamline.storage.rules.light import (
     darks_beside_views,
     exposures_agree,
@@ -34,7 +35,6 @@ from beamline.storage.rules.pixels import (
     quantity_stated,
 )
 from beamline.storage.rules.stored_order import axis_vertical, sinogram_told, views_first
-from beamline.storage.rules.treatment import frames_flagged
 from drivers.base.frame import FrameKind
 
 VARYING = "lengths"  # a rule on those that differ from view to view

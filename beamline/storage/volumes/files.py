@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.core.events import json_of
-from beamline.core.files import bring_to_disk, whole_file
+from beamline.core.files import atomic_file, bring_to_disk
 from beamline.core.quantities import VoxelKind
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import is_zarr
@@ -255,7 +255,7 @@ def write_volume(path: Path, record: ReconRecord, pixels: Pixels | None = None, 
     if pixels.window is not None and not kind.greys:
         raise ValueError(f"{kind.name} holds the values themselves (float32); leave bits and window out.")
     slices = Slices(record.volume, pixels)
-    with whole_file(path, replace=replace) as partial:
+    with atomic_file(path, replace=replace) as partial:
         kind.write(partial, record, slices)
         bring_to_disk(partial)
     return slices.outside

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
+from beamline.core.files import atomic_file
 from beamline.storage import datasets, hdf5
 from beamline.storage.disk_file import reserve
 from beamline.storage.recon_record import ReconRecord, Value
@@ -107,7 +107,7 @@ def create_partial(
         DataError: the path exists, or the disk has no room; nothing is left there.
     """
     nz, *shape = record.volume.grid.shape
-    with whole_file(path) as partial:
+    with atomic_file(path) as partial:
         write_record(partial, record, empty=True)
         with hdf5.changed(partial) as file:
             file.create_dataset(_PLACES["done_text"], (), "S40", data=f"0 of {nz} slices".encode())

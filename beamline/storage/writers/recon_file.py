@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
+from beamline.core.files import atomic_file
 from beamline.core.installed import version
 from beamline.core.quantities import VoxelKind
 from beamline.storage import datasets, hdf5
@@ -46,7 +46,7 @@ def write_reconstruction(path: Path, record: ReconRecord, *, replace: bool = Fal
     Raises:
         DataError: if `path` exists and `replace` is not set, or the disk refuses; no partial file stays.
     """
-    with whole_file(path, replace=replace) as partial:
+    with atomic_file(path, replace=replace) as partial:
         write_record(partial, record)
 
 
@@ -258,7 +258,7 @@ def write_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         DataError: the disk refuses; an older checkpoint stays as it was.
     """
-    with whole_file(path, replace=True) as partial, hdf5.created(partial) as file:
+    with atomic_file(path, replace=True) as partial, hdf5.created(partial) as file:
         file.attrs["format"], file.attrs["version"] = _FORMAT, version()
         file.attrs["steps"] = checkpoint.steps
         for group, values in (("state", checkpoint.state), ("made_from", checkpoint.made_from)):

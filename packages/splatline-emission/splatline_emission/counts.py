@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
+from beamline.core.files import atomic_file
 from beamline.storage.hdf5 import created, open_hdf5, readable
 from recon import Geometry, Grid
 
@@ -164,7 +164,7 @@ def read_counts(path: Path) -> Emission:
 
 def write_counts(path: Path, counts: F32, geometry: Geometry, sets: Mapping[str, F32]) -> None:
     """Write what `read_counts` reads. Raises DataError: `path` exists or cannot be written; nothing is left."""
-    with whole_file(path) as partial, created(partial) as file:
+    with atomic_file(path) as partial, created(partial) as file:
         group = file.create_group("emission")
         for name, values in {"counts": counts, **sets}.items():
             group.create_dataset(name, data=values, chunks=(1, *values.shape[1:]), compression="gzip", fletcher32=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from beamline.cli.options import json_option, parsed, volume_argument, volume_path
 from beamline.cli.terminal import Answer, answering
 from beamline.core.errors import DataError
-from beamline.core.files import refuse_existing, whole_file
+from beamline.core.files import atomic_file, refuse_existing
 
 if TYPE_CHECKING:
     from beamline.gaussians import Model
@@ -135,7 +135,7 @@ def surface(volume: Path, output: Path, level: float | None, as_json: bool) -> N
             mesh = surface_of(data, record.volume.grid, level)
         except ValueError as error:
             raise DataError(f"{volume}: {error}. Nothing was written.") from error
-        with whole_file(output) as partial:
+        with atomic_file(output) as partial:
             suffix = output.suffix.lower()
             how = {} if suffix == ".obj" else {"binary": True}  # OBJ is text
             meshio.Mesh(mesh.vertices, [("triangle", mesh.faces)]).write(partial, suffix[1:], **how)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
+from beamline.core.files import atomic_file
 from beamline.gaussians import Model
 from beamline.storage.hdf5 import created
 from recon import Grid, Volume, project, voxelize
@@ -62,7 +62,7 @@ def write_views(path: Path, model: Model, angles: NDArray[np.float64], count: Ca
     if model.geometry.is_cone:
         raise DataError(f"{path}: views of a cone are not written: Data Exchange does not state it.")
     geometry = replace(model.geometry.select([0]).straightened(), shifts=np.zeros((1, 2))).at(angles)
-    with whole_file(path) as partial, created(partial) as file:
+    with atomic_file(path) as partial, created(partial) as file:
         shape = (angles.size, *geometry.detector_shape)
         data = file.create_dataset("exchange/data", shape, np.float32, chunks=(1, *shape[1:]))
         data.attrs["units"] = "line_integrals"

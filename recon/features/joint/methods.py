@@ -97,7 +97,7 @@ class _History:
             self.tell(sweep, residual)
         else:
             self.tried += 1
-            self.control.tell_part(self.tried, self.tried - sweep, self.began, self.n_views, "trial sweeps")
+            self.control.report_progress(self.tried, self.tried - sweep, self.began, self.n_views, "trial sweeps")
             self.tried = 0 if sweep == 0 else self.tried
         return not self.control.stop()
 

@@ -9,7 +9,7 @@ import pytest
 
 from beamline.core import files
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file, write_whole
+from beamline.core.files import atomic_file, write_whole
 
 
 def test_what_the_disk_refuses_late_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,7 +21,7 @@ def test_what_the_disk_refuses_late_leaves_nothing(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("os.fsync", fsync)
     with pytest.raises(DataError, match=r".Input/output.*left of it"):
         write_whole(tmp_path / "page.html", "a page")
-    with pytest.raises(DataError, match="Input/output error"), whole_file(tmp_path / "folder") as partial:
+    with pytest.raises(DataError, match="Input/output error"), atomic_file(tmp_path / "folder") as partial:
         (partial / "below").mkdir(parents=True)
         (partial / "below" / "chunk").write_bytes(b"1")
     assert not list(tmp_path.iterdir())
@@ -40,7 +40,7 @@ def test_what_a_killed_program_left_is_removed_by_the_next_that_writes_there(tmp
     path, code = tmp_path / "volume.h5", "\n".join(
         (
             "import os, sys, pathlib, beamline.core.files as files",
-            "with files.whole_file(pathlib.Path(sys.argv[1])) as partial:",
+            "with files.atomic_file(pathlib.Path(sys.argv[1])) as partial:",
             "    partial.write_bytes(b'half')",
             "    if sys.argv[2] == 'dies': os._exit(9)",
             "    print(flush=True), input()",
@@ -55,7 +55,7 @@ def test_what_a_killed_program_left_is_removed_by_the_next_that_writes_there(tmp
     ) as process:
         assert process.stdout is not None and process.stdout.readline()
         (alive,) = {entry for entry in tmp_path.iterdir() if f"-{process.pid}-" in entry.name}
-        with whole_file(path) as partial:
+        with atomic_file(path) as partial:
             assert {*tmp_path.iterdir()} == {elsewhere, other, alive}
             partial.write_bytes(b"whole")
         process.kill()
@@ -69,7 +69,7 @@ def test_a_link_to_what_is_not_there_is_never_replaced(tmp_path: Path) -> None:
         for replace in (False, True):
             with pytest.raises(DataError, match=r"away/out.*Nothing was written"):
                 write_whole(path, "new", replace=replace)
-    with pytest.raises(DataError, match="is a link to"), whole_file(tmp_path / "late") as partial:
+    with pytest.raises(DataError, match="is a link to"), atomic_file(tmp_path / "late") as partial:
         partial.write_text("new")
         (tmp_path / "late").symlink_to("away/out")  # made while the file was written
     assert {*tmp_path.iterdir()} == {tmp_path / "link", tmp_path / "late"}

@@ -18,7 +18,7 @@ from beamline.monitor.digest import (
     digest,
     digests,
     preview_shape,
-    thinned,
+    subsampled,
 )
 
 shapes = st.tuples(st.integers(1, 17), st.integers(1, 17))
@@ -151,6 +151,6 @@ def test_block_means_of_other_types_are_of_the_valid_pixels(dtype: Any) -> None:
 @given(st.integers(1, 1200), st.integers(1, 1200))
 def test_thinning_bounds_the_work_and_leaves_small_previews_whole(rows: int, cols: int) -> None:
     preview = np.broadcast_to(np.float32(0), (rows, cols))
-    kept = thinned(preview).shape
+    kept = subsampled(preview).shape
     for n, k in zip((rows, cols), kept, strict=True):
         assert k == n if n < 2 * ENOUGH else ENOUGH <= k <= 2 * ENOUGH

@@ -15,7 +15,7 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import WARNED_WEIGHT
-from beamline.storage.rules.treatment import FEWEST_VIEWS
+from beamline.storage.rules.flag_policy import FEWEST_VIEWS
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 

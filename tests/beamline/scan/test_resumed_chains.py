@@ -203,8 +203,10 @@ class PartsOfARun(RuleBasedStateMachine):
         self._end(how, at)
 
     def _end(self, how: str, at: int) -> None:
+        before = len(parts_of(self.run)) if self.chain.folder.exists() else 0
         self.chain.end(how, at)
-        if how in ("stopped", "aborted", "failed") and len(self._parts_with_frames()) > 1:
+        taken = len(parts_of(self.run)) > before  # of a run with all its frames none is
+        if taken and how in ("stopped", "aborted", "failed") and len(self._parts_with_frames()) > 1:
             assert is_joined(self.joined)
         for part in parts_of(self.run):
             file = part / "scan.h5"

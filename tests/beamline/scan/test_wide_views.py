@@ -206,7 +206,7 @@ def test_stepped_views_of_another_program_come_by_poses(tmp_path: Path) -> None:
         other = prepare_projections(source, selection, lambda sentence: None)
     views, _ = prepared(path)
     assert other.geometry.shifts == pytest.approx(views.geometry.shifts)
-    assert other.ordinary.geometry.n_views == VIEWS
+    assert other.centred.geometry.n_views == VIEWS
     assert other.projections.data == pytest.approx(views.projections.data)
 
 

@@ -156,7 +156,7 @@ def test_wide_views_make_the_density_surer_and_have_no_part_in_fbp(
     both = recon.Geometry.parallel(
         np.concatenate((ANGLES, turns)), (ROWS, COLS), axis_col=GEOMETRY.axis_col, shifts=shifts
     )
-    assert both.reach == GEOMETRY.reach and both.ordinary.sum() == VIEWS
+    assert both.reach == GEOMETRY.reach and both.is_centred.sum() == VIEWS
     views = np.concatenate((wide[0], views_of(can(1.6 * COLS / 2), both.select(np.arange(VIEWS, VIEWS + 4)))))
     seen = sample_radius(Views(views, both))
     assert found is not None and seen is not None and seen.density < 0.8 * found.density

@@ -165,7 +165,7 @@ def _clearly_seen(views: PreparedProjections) -> str:
     """A sentence on hardening that nobody asked to correct, where the busiest rows show it; else ""."""
     from recon.voxels.field_edges import FieldEdges, busiest_rows
 
-    data, geometry = views.ordinary.projections.data, views.ordinary.geometry
+    data, geometry = views.centred.projections.data, views.centred.geometry
     plain = geometry.is_straight and not geometry.is_cone and not geometry.shifts.any() and views.measured is None
     if not plain or geometry.n_views < _FEWEST or FieldEdges.of(data, geometry).beyond():
         return ""

@@ -16,7 +16,7 @@ from beamline.projections.prepared import hold_out
 from beamline.projections.selection import Selection
 from beamline.projections.usable_views import WARNED_SHARE, Regions, regions_of
 from beamline.storage.flag_legend import FrameFlags
-from beamline.storage.rules.treatment import treatment_of
+from beamline.storage.rules.flag_policy import flag_policy
 from recon.prep.resample import Resampling
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
@@ -31,7 +31,7 @@ def flag(view: int, region: tuple[int, int, int, int] | None, level: Level = Lev
 
 def found(*flags: Flag, frames: int = 12) -> Regions:
     every = FrameFlags.of_flags([[f for f in flags if f.frame == row] for row in range(frames)])
-    return regions_of(treatment_of(every, np.ones(frames, np.bool_), SHAPE))
+    return regions_of(flag_policy(every, np.ones(frames, np.bool_), SHAPE))
 
 
 def test_a_region_and_its_margin_weigh_less_of_an_alarm_nothing() -> None:

@@ -14,7 +14,7 @@ from beamline.projections.selection import Selection
 from beamline.storage.flag_legend import TODAY, FrameFlags
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.readers.transforms import cropped
-from beamline.storage.rules.treatment import treatment_of
+from beamline.storage.rules.flag_policy import flag_policy
 from recon.prep.resample import Distortion
 from tests.beamline.array_source import ArraySource
 from tests.beamline.storage.readers.test_conformance import FRAMES, SCANS
@@ -63,7 +63,7 @@ def test_regions_of_flags_move_with_the_columns(cols: tuple[int, int], left: int
 
     source: Any = cropped(_Flagged(), cols)
     assert source.axis_col == 52.5 - cols[0]
-    treated = treatment_of(source.table.flags, np.ones(3, np.bool_), source.shape)
+    treated = flag_policy(source.table.flags, np.ones(3, np.bool_), source.shape)
     (box,) = regions_of(treated).boxes
     assert box[2:].tolist() == [left, right] and treated.masked.tolist() == [False, True, False]
 

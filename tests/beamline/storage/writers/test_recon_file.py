@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from beamline.core.errors import DataError
-from beamline.core.files import whole_file
+from beamline.core.files import atomic_file
 from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers import recon_file as checkpoint_file
 from beamline.storage.writers.recon_file import (
@@ -92,7 +92,7 @@ def test_everything_comes_back(
 
 def test_refuses_a_file_that_appeared_meanwhile(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
-    with pytest.raises(DataError, match="never overwritten"), whole_file(path) as partial:
+    with pytest.raises(DataError, match="never overwritten"), atomic_file(path) as partial:
         partial.write_text("ours")
         path.write_text("theirs")
     assert path.read_text() == "theirs"

@@ -13,7 +13,7 @@ from beamline.projections.usable_views import usable_views
 from beamline.storage.flag_legend import FrameFlags
 from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.evidence import EvidenceRequest, ScanEvidence
-from beamline.storage.rules.treatment import frames_flagged
+from beamline.storage.rules.flag_policy import frames_flagged
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
 
 FRAMES = frames_of(TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0))))  # 2 darks, 2 flats, 18 views

@@ -1,4 +1,4 @@
-"""Treatment: how a reconstruction uses views by their flags, in the words of every command; and flags as a finding."""
+"""FlagPolicy: how a reconstruction uses views by their flags, in the words of every command; and flags as a finding."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MARGIN = 0.25  # of the region's shorter side, on all sides
 
 
 @dataclass(frozen=True, eq=False)
-class Treatment:
+class FlagPolicy:
     """How the flagged views of a scan are treated.
 
     Attributes:
@@ -57,7 +57,7 @@ class Treatment:
         return f"Of {self.views.sum()} views {', '.join(parts)}." if parts else ""
 
 
-def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Treatment:
+def flag_policy(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> FlagPolicy:
     """How `beamline recon` treats these views, whose frames have this shape, unless it ignores flags.
 
     A view in which the sample jumped is as good as those after it. Flags of views from opposite sides for the same jump
@@ -77,7 +77,7 @@ def treatment_of(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> Trea
     local = flags.flagged & ~np.isin(np.arange(flags.bits.size), list(whole))
     parts = [(frame, box, alarm) for frame, box, alarm in boxes if box is not None and frame not in whole]
     left_out, halved = (views & some & ~local for some in (flags.alarmed, flags.flagged & ~flags.alarmed))
-    return Treatment(flags, views, left_out, halved, views & local, jumped, parts)
+    return FlagPolicy(flags, views, left_out, halved, views & local, jumped, parts)
 
 
 def boxes_of(
@@ -133,7 +133,7 @@ def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:
             yield Finding("info", FLAGS, f"{message} No other frame has an alarm.")
             return
         message += f" Frames with an alarm beside these: {spans(rows.tolist())}."
-    treated = treatment_of(flags, scan.table.are_views, scan.source.shape)
+    treated = flag_policy(flags, scan.table.are_views, scan.source.shape)
     n, lost = int(treated.views.sum()), int(treated.left_out.sum())
     if lost and n - lost < FEWEST_VIEWS:
         message += (
