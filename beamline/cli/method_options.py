@@ -209,8 +209,8 @@ _ALLOW_NEGATIVE = option(
 )
 _IN_TIME = together(
     option(
-        "--time",
-        "volumes",
+        "--volumes",
+        former="--time",
         setting="volumes",
         excludes={**_FINISHED, **_OF_ONE_VOLUME},
         type=click.IntRange(min=2),
@@ -221,9 +221,9 @@ _IN_TIME = together(
     option(
         "--moves/--no-moves",
         setting="moves",
-        needs=("time", "sets volumes in time: give --time N with it."),
+        needs=("volumes", "sets volumes in time: give --volumes N with it."),
         default=None,
-        help="With --time: matter moves, or only its density changes. Default: chosen by held-out views.",
+        help="With --volumes: matter moves, or only its density changes. Default: chosen by held-out views.",
     ),
 )
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
@@ -232,7 +232,7 @@ equal_time = option(
     "--seconds",
     excludes={
         "iterations": "give one of them",
-        **dict.fromkeys(("time", "spectra"), "it belongs to methods that make one volume"),
+        **dict.fromkeys(("volumes", "spectra"), "it belongs to methods that make one volume"),
     },
     type=POSITIVE,
     metavar="EACH",

@@ -64,7 +64,7 @@ def unknown_method(name: str, legal: Iterable[str]) -> str:
 
 
 _ELSEWHERE = {
-    "times": "makes several volumes, in time: use beamline recon --time N",
+    "times": "makes several volumes, in time: use beamline recon --volumes N",
 }
 """Of methods that make several volumes: what takes them."""
 
