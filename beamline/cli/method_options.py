@@ -9,15 +9,7 @@ from typing import Any, get_args
 
 import click
 
-from beamline.cli.options import (
-    POSITIVE,
-    Declared,
-    NameChoice,
-    declared,
-    option,
-    parsed,
-    together,
-)
+from beamline.cli.options import POSITIVE, Declared, NameChoice, WholeRange, declared, option, parsed, together
 from beamline.cli.recipe import METHOD, OUTPUT, RESOURCES, heading
 from beamline.core.errors import DataError
 from recon.assess.time_model import PRESETS, parse_budget
@@ -162,28 +154,28 @@ _STEPS = option(
     "--steps",
     setting="steps",
     excludes={"seconds": "give one of them", **_PLANNED},
-    type=click.IntRange(min=1),
+    type=WholeRange(min=1),
     help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}.",
 )
 _GAUSSIANS = option(
     "--gaussians",
     setting="gaussians",
     excludes=_PLANNED,
-    type=click.IntRange(min=1),
+    type=WholeRange(min=1),
     help="Number of Gaussians at the start.",
 )
 _FINISH = option(
     "--finish",
     setting="finish",
     excludes={**_PLANNED, **_FINISHED},
-    type=click.IntRange(min=0),
+    type=WholeRange(min=0),
     help="Sweeps on voxels after the fit, which bring back edges, cracks and pores; 0: none. Default: 8, and steps "
     "with sparse patches where these predict held-out views better.",
 )
 _ITERATIONS = option(
     "--iterations",
     setting="iterations",
-    type=click.IntRange(min=1),
+    type=WholeRange(min=1),
     help="Iterations of an iterative method. Default: depends on the method.",
 )
 _TV_WEIGHT = option(
@@ -213,7 +205,7 @@ _IN_TIME = together(
         former="--time",
         setting="volumes",
         excludes={**_FINISHED, **_OF_ONE_VOLUME},
-        type=click.IntRange(min=2),
+        type=WholeRange(min=2),
         metavar="N",
         help="For a sample that changes during the scan: N volumes at even times, in one .h5, from one fit of all "
         "views. Each needs twelve views or more.",

@@ -316,7 +316,7 @@ def describe(
     free = "" if free_bytes is None else f"; {size(free_bytes)} free"
     facts += [
         ("camera", f"{rows} x {cols} px of {camera.bits} bits, least time between triggers {camera.min_period:.6g} s"),
-        ("duration", f"{duration_text(timeline.duration)} (without shutter and sample moves)"),
+        ("duration", f"{hms_text(timeline.duration)} (without shutter and sample moves)"),
         ("size", f"{timeline.n_frames} frames of {size(timeline.frame_bytes)} and previews = {total}{free}"),
     ]
     lines += ["", *(f"{name:<10}{text}" for name, text in facts)]
@@ -330,7 +330,7 @@ def _angles(angles: NDArray[np.float64]) -> str:
     return f"{degrees(float(angles[0]))} ... {degrees(float(angles[-1]))}"
 
 
-def duration_text(seconds: float) -> str:
+def hms_text(seconds: float) -> str:
     """`1:02:03 = 3723.0 s`."""
     whole = round(seconds)
     return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02} = {seconds:.1f} s"

@@ -29,7 +29,7 @@ from beamline.monitor.watch import start as start_monitor
 from beamline.plan.limits import ROOM
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
-from beamline.plan.timeline import duration_text, work_out
+from beamline.plan.timeline import hms_text, work_out
 from beamline.scan.live_plan import better_order, live_need
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
@@ -79,7 +79,7 @@ class DryRun:
             seconds = sum(need.duration for need in each)
             sentence = (
                 f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, a scan like this of each: "
-                f"{duration_text(seconds)} and {size(self.total_bytes)} in all (without the monochromator's moves)"
+                f"{hms_text(seconds)} and {size(self.total_bytes)} in all (without the monochromator's moves)"
             )
             lines.append(f"{'energies':<10}{sentence}")
         return lines
