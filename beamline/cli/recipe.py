@@ -133,7 +133,8 @@ def _read(path: Path) -> Mapping[str, Any]:
     try:
         text = _text(path)
     except (OSError, UnicodeDecodeError) as error:
-        raise click.BadParameter(f"{path} cannot be read ({error})") from error
+        why = getattr(error, "strerror", None) or error
+        raise click.BadParameter(f"{path} cannot be read ({why})") from error
     from beamline.config.tree import yaml_faults  # here, because it loads pydantic
 
     with yaml_faults(text, str(path)):
