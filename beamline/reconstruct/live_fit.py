@@ -101,7 +101,7 @@ class ScanFollower:
 
     @property
     def has_volume(self) -> bool:
-        """Whether there is a model with enough views for a volume, should the fit stop now."""
+        """Whether the fit has taken enough views to give a volume if it stops now."""
         return self._fit is not None and self._fit.started and self.n_views_taken >= _LEAST_VIEWS
 
     def take_new_frames(self, ended: bool) -> bool:
