@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 from recon.base.registry import ADD_ONS, add_on_missing, did_you_mean
 from recon.base.setting import Setting
@@ -182,8 +182,8 @@ def _words(branch: Schema) -> str:
     kind = str(branch.get("type"))
     if kind in ("number", "integer"):
         text = "a whole number" if kind == "integer" else "a number"
-        bounds = Setting(**{name: float(branch[key]) for name, key in _BOUNDS.items() if key in branch})
-        return f"{text} {bounds.words}".strip()
+        given = {name: float(branch[key]) for name, key in _BOUNDS.items() if key in branch}
+        return f"{text} {Setting(**cast(Any, given)).words}".strip()
     if kind == "array" and "items" in branch:
         return f"a list of {branch.get('minItems', 0)} or more: {_words(branch['items'])}"
     if kind == "array":
