@@ -202,7 +202,8 @@ def test_scripts_of_scans(monkeypatch: Patch, tmp_path: Path, capsys: pytest.Cap
     small(monkeypatch, wide, balls=lambda *_: np.array([[2.0, 1.0, 0.0, 3.0]]))
     called(
         monkeypatch, wide,
-        "--seeds", 7, "--over", 1.5, "--methods", "fbp", "--columns", 32, "--rows", 2, "--views", 16, "--wide-views", 2,
+        "--seeds", 7, "--over", 1.5, "--methods", "fbp", "--columns", 32, "--rows", 2, "--views", 16,
+        "--offset-views", 2,
     )  # fmt: skip
     full = script("full_scan")
     small(monkeypatch, full, BAND=4)
@@ -260,8 +261,8 @@ def test_next_pass(monkeypatch: Patch, tmp_path: Path) -> None:
     scores.scores = {f"0|0|r2|{bench.State(n)}": bench.Score(20.0 + n, 1.0, 1.0) for n in range(1, bench.PASSES + 1)}
     assert "hindsight" in bench.table(scores, [0])
     small(monkeypatch, bench.ScoreFile, law=lambda *_: ErrorLaw(90, 0.5, 0.1, 1.0))
-    assert "predictions" in policy.table(scores, [0], [0], policy.Wish(quality_db=1.0))
-    assert devices.config_of(2).scan.wide_views == devices.WIDE_ANGLES
+    assert "predictions" in policy.table(scores, [0], [0], policy.ScanTarget(quality_db=1.0))
+    assert devices.config_of(2).scan.offset_views == devices.WIDE_ANGLES
     case = toy_case()
     scene = script("next_pass_scenes").Scene(case.projections, case.projections[:0], case.truth, case.geometry)
     small(monkeypatch, bench, _scene=lambda number: scene, _noisy=lambda *_: case.projections, PASS=12)

@@ -90,7 +90,7 @@ def decide(words: tuple[str, ...]) -> None:
     """Tell the scan in the folder RUN (the running one of ./runs), while it asks, what to measure next.
 
     With `scan.decide: ask` a scan asks after each pass of views: the next pass of the plan, the angles of the last one
-    again, the wide views, views that were flagged, or no further pass.
+    again, the offset views, views that were flagged, or no further pass.
 
     Exit code: 0 the scan has obeyed, 2 no scan runs there, it does not ask, or it takes another choice, 5 disk error.
     """

@@ -9,15 +9,7 @@ from typing import Any, get_args
 
 import click
 
-from beamline.cli.options import (
-    POSITIVE,
-    Declared,
-    NameChoice,
-    declared,
-    option,
-    parsed,
-    together,
-)
+from beamline.cli.options import POSITIVE, Declared, NameChoice, WholeRange, declared, option, parsed, together
 from beamline.cli.recipe import METHOD, OUTPUT, RESOURCES, heading
 from beamline.core.errors import DataError
 from recon.assess.time_model import PRESETS, parse_budget
@@ -162,28 +154,28 @@ _STEPS = option(
     "--steps",
     setting="steps",
     excludes={"seconds": "give one of them", **_PLANNED},
-    type=click.IntRange(min=1),
+    type=WholeRange(min=1),
     help=f"Steps of the fit of Gaussians. Default: {DEFAULT_STEPS}.",
 )
 _GAUSSIANS = option(
     "--gaussians",
     setting="gaussians",
     excludes=_PLANNED,
-    type=click.IntRange(min=1),
+    type=WholeRange(min=1),
     help="Number of Gaussians at the start.",
 )
 _FINISH = option(
     "--finish",
     setting="finish",
     excludes={**_PLANNED, **_FINISHED},
-    type=click.IntRange(min=0),
+    type=WholeRange(min=0),
     help="Sweeps on voxels after the fit, which bring back edges, cracks and pores; 0: none. Default: 8, and steps "
     "with sparse patches where these predict held-out views better.",
 )
 _ITERATIONS = option(
     "--iterations",
     setting="iterations",
-    type=click.IntRange(min=1),
+    type=WholeRange(min=1),
     help="Iterations of an iterative method. Default: depends on the method.",
 )
 _TV_WEIGHT = option(
@@ -209,11 +201,11 @@ _ALLOW_NEGATIVE = option(
 )
 _IN_TIME = together(
     option(
-        "--time",
-        "volumes",
+        "--volumes",
+        former="--time",
         setting="volumes",
         excludes={**_FINISHED, **_OF_ONE_VOLUME},
-        type=click.IntRange(min=2),
+        type=WholeRange(min=2),
         metavar="N",
         help="For a sample that changes during the scan: N volumes at even times, in one .h5, from one fit of all "
         "views. Each needs twelve views or more.",
@@ -221,9 +213,9 @@ _IN_TIME = together(
     option(
         "--moves/--no-moves",
         setting="moves",
-        needs=("time", "sets volumes in time: give --time N with it."),
+        needs=("volumes", "sets volumes in time: give --volumes N with it."),
         default=None,
-        help="With --time: matter moves, or only its density changes. Default: chosen by held-out views.",
+        help="With --volumes: matter moves, or only its density changes. Default: chosen by held-out views.",
     ),
 )
 row_options = together(heading(METHOD), _STEPS, _GAUSSIANS, _FINISH, _ITERATIONS, _TV_WEIGHT, _PATCH_THRESHOLD)
@@ -232,7 +224,7 @@ equal_time = option(
     "--seconds",
     excludes={
         "iterations": "give one of them",
-        **dict.fromkeys(("time", "spectra"), "it belongs to methods that make one volume"),
+        **dict.fromkeys(("volumes", "spectra"), "it belongs to methods that make one volume"),
     },
     type=POSITIVE,
     metavar="EACH",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -23,17 +22,30 @@ from beamline.core.events import Event, Failed, Sink
 from beamline.core.sinks import JsonLines, fan_out
 from drivers.base.clock import SystemClock
 from recon.base.registry import unknown
+from recon.base.setting import Setting
 from recon.methods import METHODS
+
+
+def _within(bounds: click.FloatRange | click.IntRange, number: Any, *place: Any) -> Any:
+    """The number, where it is within the bounds; else it is refused in the words of a declared value."""
+    low, high = "gt" if bounds.min_open else "ge", "lt" if bounds.max_open else "le"
+    if fault := Setting(**{low: bounds.min, high: bounds.max}).fault(number):
+        bounds.fail(f"{number}; {fault}.", *place)
+    return number
 
 
 class FiniteRange(click.FloatRange):
     """A range of finite numbers; click's own range accepts NaN and infinities."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        number = super().convert(value, param, ctx)
-        if not math.isfinite(number):
-            self.fail(f"{value!r} is not a finite number.", param, ctx)
-        return number
+        return _within(self, click.FLOAT.convert(value, param, ctx), param, ctx)
+
+
+class WholeRange(click.IntRange):
+    """A range of whole numbers."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return _within(self, click.INT.convert(value, param, ctx), param, ctx)
 
 
 class NameChoice(click.Choice):  # type: ignore[type-arg]
@@ -64,13 +76,13 @@ def unknown_method(name: str, legal: Iterable[str]) -> str:
 
 
 _ELSEWHERE = {
-    "times": "makes several volumes, in time: use beamline recon --time N",
+    "times": "makes several volumes, in time: use beamline recon --volumes N",
 }
 """Of methods that make several volumes: what takes them."""
 
 POSITIVE = FiniteRange(min=0, min_open=True)
 NOT_NEGATIVE = FiniteRange(min=0)
-SEED = click.IntRange(min=0)
+SEED = WholeRange(min=0)
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 

@@ -110,15 +110,20 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
         for option in ctx.command.params
         if isinstance(option, click.Option) and not _is_of_one_call(option)
     }
+    former = {
+        option.former.lstrip("-"): option
+        for option in options.values()
+        if isinstance(option, Declared) and option.former
+    }
     defaults: dict[str, Any] = {}
     for name, text in _read(value).items():
-        if name not in options:
+        if name not in options and name not in former:
             raise click.BadParameter(f"{value}: {unknown('option of a recipe', name, options)}")
         if not isinstance(text, str) or not text:
             raise click.BadParameter(
                 f"{value}: {name} is not a single value; expected one value, as on the command line"
             )
-        option = options[name]
+        option = options[name] if name in options else former[name]
         defaults[str(option.name)] = text.split() if option.multiple else text
     ctx.default_map = defaults
 
@@ -128,7 +133,8 @@ def _read(path: Path) -> Mapping[str, Any]:
     try:
         text = _text(path)
     except (OSError, UnicodeDecodeError) as error:
-        raise click.BadParameter(f"{path} cannot be read ({error})") from error
+        why = getattr(error, "strerror", None) or error
+        raise click.BadParameter(f"{path} cannot be read ({why})") from error
     from beamline.config.tree import yaml_faults  # here, because it loads pydantic
 
     with yaml_faults(text, str(path)):

@@ -53,7 +53,7 @@ def recon(**values: Any) -> None:
     the first Ctrl-C stops with the volume reached so far (exit code 4), the second discards it. Finished
     slabs of a large volume are kept, even after a kill, in OUTPUT.partial.h5; --resume goes on from there.
 
-    --time N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
+    --volumes N fits a sample that changes while it is scanned: N volumes in time, which `beamline view` plays.
     """
     there = not values["follow"] and values["write_config"] is None  # a recipe needs no scan
     options = options_of(click.get_current_context(), there=there)
@@ -125,7 +125,7 @@ def _checked_method(context: click.Context, default: str = "") -> str:
     if method is None:
         of_a_method = {name for name, param in declared(context.command).items() if param.setting or param.argument}
         of_fits = values["follow"] or values["any_setting"] or (of_a_method & asked) - {"budget", "quality"}
-        method = default or (_in_time() if "time" in asked else DEFAULT if of_fits else AUTO)
+        method = default or (_in_time() if "volumes" in asked else DEFAULT if of_fits else AUTO)
     refuse_contradictions(context.command, asked, {SLABS_RESUMED: f"--resume {values['resume']}"})
     refuse_other_methods(context.command, asked, method, stated=stated)
     for step in chosen_steps(values) if values["follow"] and streams(method) else ():
@@ -136,7 +136,7 @@ def _checked_method(context: click.Context, default: str = "") -> str:
 
 def _in_time() -> str:
     if IN_TIME is None:
-        raise click.UsageError("--time: this installation cannot reconstruct a time series. Leave it out.")
+        raise click.UsageError("--volumes: this installation cannot reconstruct a time series. Leave it out.")
     return IN_TIME
 
 

@@ -146,7 +146,9 @@ recon_options = together(
         help="Follow a running scan: reconstruct while it grows. A method that needs all views waits for its end.",
     ),
     option(
-        "--earlier",
+        "--previous-part",
+        "earlier",
+        former="--earlier",
         needs=("follow", "is for a run that goes on: give --follow, or the joined.h5 of its parts."),
         of_one_call=True,
         type=click.Path(path_type=Path),

@@ -189,12 +189,12 @@ def _ask_about(config: Config, *, asked: bool) -> None:
 
 def rehearsed_lines(config: Config, result: RunResult, request: ScanRequest) -> list[str]:
     """Duration of the rehearsal and of the scan, as lines."""
-    from beamline.plan.timeline import duration_text
+    from beamline.plan.timeline import hms_text
     from beamline.scan.preflight import dry_run
 
-    planned = duration_text(dry_run(config, request.output).timeline.duration)
+    planned = hms_text(dry_run(config, request.output).timeline.duration)
     return [
-        f"{'rehearsed':<10}in {duration_text(result.seconds)}. At the instrument the plan takes {planned}, without "
+        f"{'rehearsed':<10}in {hms_text(result.seconds)}. At the instrument the plan takes {planned}, without "
         "moves of shutter and sample"
     ]
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import POSITIVE, FiniteRange, NameChoice, option, parsed, together
+from beamline.cli.options import POSITIVE, FiniteRange, NameChoice, WholeRange, option, parsed, together
 from beamline.cli.recipe import CORRECTIONS, DATA, heading
 from beamline.projections.protocols import PrepStep
 from beamline.projections.registry import registered, steps_of
@@ -247,7 +247,7 @@ _BEFORE = (
     option(
         "--bin",
         "binning",
-        type=click.IntRange(min=1),
+        type=WholeRange(min=1),
         default=1,
         show_default=True,
         help="Average blocks of N x N pixels.",
@@ -263,7 +263,7 @@ _BEFORE = (
     ),
     option(
         "--sample-width",
-        type=click.FloatRange(min=0, min_open=True),
+        type=FiniteRange(min=0, min_open=True),
         metavar="MM",
         help="Width of a sample that is wider than the field, which is reconstructed as wide as it is (in px where the "
         "pixel size is unknown). Default: as the scan file says, or measured by views held out.",
@@ -273,7 +273,7 @@ _AFTER = (
     heading(DATA),
     option(
         "--frames-per-view",
-        type=click.IntRange(min=1),
+        type=WholeRange(min=1),
         metavar="N",
         help="Average N successive projections to one view, such as those that a step scan takes at one angle; 1: "
         "average none. Default: as the plan in the scan file says.",

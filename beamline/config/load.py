@@ -190,8 +190,8 @@ def plan_of(config: Config) -> ScanPlan:
         period=scan.period_s,
         settle=scan.settle_s,
         warm_up=scan.warm_up_s,
-        wide_views=scan.wide_views,
-        wide_places=wide_places(config),
+        offset_views=scan.offset_views,
+        offset_places=offset_places(config),
         filter=scan.filter,
         energy=scan.energy,
         darks=_field(scan.darks, scan.exposure_s),
@@ -272,9 +272,9 @@ def faults(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     numbers = ((at, ".".join(at), value) for at, value in quantities(config.model_dump(exclude={"simulation"})))
     yield from ((at, doubt(name, value)) for at, name, value in numbers if is_impossible(name, value))
     try:
-        wide_places(config)
+        offset_places(config)
     except ValueError as error:
-        yield ("scan", "wide_views"), f"scan.wide_views {config.scan.wide_views}: {error}"
+        yield ("scan", "offset_views"), f"scan.offset_views {config.scan.offset_views}: {error}"
 
 
 def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str]]:
@@ -328,11 +328,11 @@ def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> 
     return CameraSettings(exposure, trigger, camera.roi, camera.binning, camera.readout)
 
 
-def wide_places(config: Config) -> tuple[float, ...]:
-    """mm that the sample is stepped aside for wide views: by 0.9 of the field, until a twentieth of it shows air beyond
-    the sample on either side. ValueError: why it cannot be."""
+def offset_places(config: Config) -> tuple[float, ...]:
+    """The sample's places in mm for offset views: by 0.9 of the field, until a twentieth of it shows air beyond the
+    sample on either side. ValueError: why it cannot be."""
     mover, camera, diameter = config.devices.sample_mover, config.devices.camera, config.sample.diameter_mm
-    if not config.scan.wide_views:
+    if not config.scan.offset_views:
         return ()
     if diameter is None:
         raise ValueError("how far the sample is stepped follows from its diameter; set sample.diameter_mm")
@@ -346,7 +346,7 @@ def wide_places(config: Config) -> tuple[float, ...]:
     n = math.ceil((diameter / field / 2 + off_middle - 0.45) / 0.9)
     if n < 1:
         raise ValueError(
-            f"the field of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set scan.wide_views to 0"
+            f"the field of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set scan.offset_views to 0"
         )
     places = tuple(0.9 * field * step for step in range(-n, n + 1) if step)
     if isinstance(mover, StageMover):

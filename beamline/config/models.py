@@ -109,7 +109,7 @@ class Fields(Section):
     exposure_s: Seconds | None = None
 
 
-class WishSection(Section):
+class TargetSection(Section):
     """What ends a scan that decides, whichever comes first; null: that does not end it."""
 
     quality_db: float | None = setting(
@@ -151,22 +151,22 @@ class ScanSection(Section):
         min_length=2,
         max_length=1000,
     )
-    wide_views: int = setting(
+    offset_views: int = setting(
         0,
         "Angles at which a sample wider than the field is stepped across the beam after the views, "
         "until all was shown.",
         ge=0,
         le=100,
     )
-    without_watchdog: Literal["warn", "pause"] = setting(
+    on_watchdog_loss: Literal["warn", "pause"] = setting(
         "warn", "The behaviour of a scan without a watchdog, or with one that ended and could not be replaced."
     )
     decide: Literal["off", "ask", "do"] = setting(
         "off",
         "What follows each pass of views: the plan (off), what the operator answers (ask), or the best "
-        "gain a second until the wish is met (do).",
+        "gain a second until the target is met (do).",
     )
-    wish: WishSection = WishSection(quality_db=1.0)
+    target: TargetSection = TargetSection(quality_db=1.0)
     wait_s: float = setting(
         30.0, "Longest wait for a prediction after a pass, and again for the operator's answer.", ge=0, le=3600
     )

@@ -35,6 +35,14 @@ _TAGGED = "text that begins with ! or = needs quotes"
 _NO_SPACE = re.compile(r"[\s-]*[\w.]+:[^\s:/\\]")
 
 
+RENAMED: Mapping[KeyPath, str] = {
+    ("scan", "wide_views"): "offset_views",
+    ("scan", "wish"): "target",
+    ("scan", "without_watchdog"): "on_watchdog_loss",
+}
+"""Names of keys in the last version, which are still understood, and their names now."""
+
+
 class _Loader(yaml.SafeLoader):
     """Plain values; a date is text, as in the name of a sample."""
 
@@ -72,7 +80,17 @@ def read(text: str, name: str) -> Tree:
         )
     if not isinstance(data, dict):
         raise ConfigError(f"{name}:1: has no `key: value` lines; `beamline config init` prints a complete example.")
+    for old, new in RENAMED.items():
+        group = data.get(old[0])
+        if isinstance(group, dict) and old[1] in group and new not in group:
+            group[new] = group.pop(old[1])
+            origins = {(*_present_name(path[:2]), *path[2:]): place for path, place in origins.items()}
     return Tree(data, origins)
+
+
+def _present_name(path: KeyPath) -> KeyPath:
+    """The path with the name that its key has now."""
+    return (path[0], RENAMED[path]) if path in RENAMED else path
 
 
 def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
@@ -200,6 +218,7 @@ def override(
         changes.append((key.strip().split("."), value, f"--set {word}"))
     data, origins = deepcopy(tree.data), dict(tree.origins)
     for keys, text, origin in changes:
+        keys = [*map(str, _present_name(tuple(keys[:2]))), *keys[2:]]
         plain = text.strip()[:1] not in ("'", '"') and text.strip() not in _NOTHING and is_text(keys)
         group, path = data, tuple(keys)
         for key in keys[:-1]:
@@ -216,8 +235,8 @@ REMOVED = {
     "monitor.model": _OWN_VIEWS,
     "monitor.policy.model": _OWN_VIEWS,
     "monitor.dark.light": "references.light_in_darks is the fraction of the flats from which darks have light",
-    "recon.stop_when": "scan.decide: do with scan.wish: {quality_db: 0.5} ends a scan when all views to come would add "
-    "0.5 dB at most",
+    "recon.stop_when": "scan.decide: do with scan.target: {quality_db: 0.5} ends a scan when all views to come would "
+    "add 0.5 dB at most",
     "scan.return_views": "The check `opposite` shows motion of the sample, by views half a turn apart",
 }
 """Keys of 1.0.0 that were removed, each with what does the same."""

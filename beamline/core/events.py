@@ -187,13 +187,13 @@ class PassEnded(Event, event="pass_ended"):
     """A pass of views is over. What is next is being chosen, or the operator is asked.
 
     Attributes:
-        number: of this event, from 1: after a pass, wide views or retakes; n_views: so far.
+        number: of this event, from 1: after a pass, offset views or retakes; n_views: so far.
         options: what can be measured next, `beamline.plan.choose.PassOption` by their values: choice, frames, seconds,
             dose (share of the plan's), bytes, and gain, low, high in dB (None: not known).
         recommended: the choice that the program takes or would take.
         wait: real s for which the operator is asked; 0: nobody is.
         remark: a sentence on why no gain is known; "" where they are.
-        passes: that are over; wide views and retakes are none.
+        passes: that are over; offset views and retakes are none.
     """
 
     number: int

@@ -196,8 +196,8 @@ def _refuse_unrecordable(config: Config, scene: Scene) -> None:
             f"devices.camera.roi: the scene is a cone beam, whose central ray meets the middle of the sensor's rows; "
             f"{rows} of them begin at {(height - rows) // 2} then, not at {row0}. Nothing was started."
         )
-    if config.scan.wide_views:
-        raise ConfigError("scan.wide_views is for a parallel beam; the scene is a cone beam. Nothing was started.")
+    if config.scan.offset_views:
+        raise ConfigError("scan.offset_views is for a parallel beam; the scene is a cone beam. Nothing was started.")
     if config.optics.axis_col is None:
         raise ConfigError(
             "optics.axis_col: the scene is a cone beam, whose axis is not searched while views come; set it, here "

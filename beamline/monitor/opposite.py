@@ -206,8 +206,8 @@ class OppositeCheck(Logged):
         )
         advice = (
             f"Against {other}, {change}. Look at both. Of views around a jump that `motion` saw, `beamline recon` "
-            "leaves out the shorter side. A sample that crept or changed is followed by `beamline recon --time N`; or "
-            "scan again, faster."
+            "leaves out the shorter side. A sample that crept or changed is followed by `beamline recon --volumes N`; "
+            "or scan again, faster."
         )
         return Flag(self.name, Level.WARN, row, score, limit, advice)
 

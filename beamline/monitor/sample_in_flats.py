@@ -168,7 +168,7 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 
 def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """Views differ from flats and from one another by noise alone."""
+    """A finding where views differ from flats and from one another by noise alone."""
     if (depth := _depth_over_air(evidence)) is None:
         return
     mean = depth.mean(axis=0)

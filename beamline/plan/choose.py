@@ -1,4 +1,4 @@
-"""Choose: what can be measured after a pass, what each choice costs and would bring, and which one a wish asks for."""
+"""What can be measured after a pass, what each choice costs and would bring, and which one a target asks for."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class PassOption:
 
 
 @dataclass(frozen=True)
-class Wish:
-    """What a scan is to reach; None: no such wish.
+class ScanTarget:
+    """What a scan is to reach; None: no such target.
 
     Attributes:
         quality_db: dB of PSNR by which the volume may stay below that of the whole plan.
@@ -50,7 +50,7 @@ class Wish:
 
 def frame_dose(timeline: Timeline) -> float:
     """The share of one frame in the exposures of the whole plan with light on the sample."""
-    return 1 / sum(block.n for block in timeline.blocks if block.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW))
+    return 1 / sum(block.n for block in timeline.blocks if block.kind in (FrameKind.PROJECTION, FrameKind.OFFSET_VIEW))
 
 
 def options(
@@ -74,32 +74,32 @@ def options(
         offered.append(option(Choice.NEXT, following.n_to_take, seconds_of(following), views=following.n_to_take))
         if passes.may_repeat:
             offered.append(option(Choice.AGAIN, last.n_to_take, seconds_of(last), again=last.n_to_take))
-    if passes.wide:
-        frames, seconds = sum(block.n_to_take for block in passes.wide), sum(map(seconds_of, passes.wide))
-        offered.append(option(Choice.WIDE, frames, seconds, wide=True))
+    if passes.offset:
+        frames, seconds = sum(block.n_to_take for block in passes.offset), sum(map(seconds_of, passes.offset))
+        offered.append(option(Choice.OFFSET, frames, seconds, wide=True))
     if n:
         offered.append(option(Choice.RETAKE, n, n * timeline.retake_seconds / timeline.plan.retakes, views=n))
     return (*offered, PassOption(Choice.ENOUGH, 0, 0.0, 0.0, 0, 0.0, 0.0, 0.0))
 
 
 def choose(
-    offered: Sequence[PassOption], wish: Wish, remaining: Gain, seconds: float, dose: float
+    offered: Sequence[PassOption], target: ScanTarget, remaining: Gain, seconds: float, dose: float
 ) -> tuple[Choice, str]:
-    """The choice with the best gain a second until the wish is met, and why.
+    """The choice with the best gain a second until the target is met, and why.
 
     The next pass of the plan keeps its place unless another choice is better beyond the uncertainty of both.
 
     Args:
         offered: with known gains.
         remaining: by all that the plan still has, as of `remaining_gain`.
-        seconds, dose: that the scan has taken, with what follows the passes in any case: wide views, references.
+        seconds, dose: that the scan has taken, with what follows the passes in any case: offset views, references.
     """
-    if wish.quality_db is not None and remaining.at_most <= wish.quality_db:
+    if target.quality_db is not None and remaining.at_most <= target.quality_db:
         return Choice.ENOUGH, (
             f"all that the plan still has would add {remaining.mean:.2f} dB ({remaining.low:.2f} to "
-            f"{remaining.high:.2f}); {wish.quality_db:g} dB less is accepted"
+            f"{remaining.high:.2f}); {target.quality_db:g} dB less is accepted"
         )
-    excesses = {option: _excess(option, wish, seconds, dose) for option in offered if option.gain > 0}
+    excesses = {option: _excess(option, target, seconds, dose) for option in offered if option.gain > 0}
     allowed = [option for option, excess in excesses.items() if not excess]
     if not allowed:
         return Choice.ENOUGH, next(iter(excesses.values()), "nothing that is left would improve the volume")
@@ -115,30 +115,30 @@ def choose(
 def remaining_gain(passes: Passes, law: ErrorLaw) -> Gain:
     """The gain by all that the plan still has."""
     views = sum(block.n_to_take for block in passes.to_come) + passes.retakes
-    return replace(law, n_views=passes.n_frames).gain(views=views, wide=bool(passes.wide))
+    return replace(law, n_views=passes.n_frames).gain(views=views, wide=bool(passes.offset))
 
 
 def next_is_sure(
-    passes: Passes, offered: Sequence[PassOption], wish: Wish, law: ErrorLaw, seconds: float, dose: float
+    passes: Passes, offered: Sequence[PassOption], target: ScanTarget, law: ErrorLaw, seconds: float, dose: float
 ) -> bool:
     """Whether the law of an earlier pass already decides: it chooses the next pass, and after that pass the plan surely
-    still has more to gain than the wish accepts to lose.
+    still has more to gain than the target accepts to lose.
     """
-    choice, _ = choose(offered, wish, remaining_gain(passes, law), seconds, dose)
+    choice, _ = choose(offered, target, remaining_gain(passes, law), seconds, dose)
     later = remaining_gain(passes.after(Choice.NEXT), law)
-    return choice is Choice.NEXT and (wish.quality_db is None or later.low > wish.quality_db)
+    return choice is Choice.NEXT and (target.quality_db is None or later.low > target.quality_db)
 
 
-def _excess(option: PassOption, wish: Wish, seconds: float, dose: float) -> str:
-    """Which limit of the wish an option would exceed, in words; "" if none. Wide views come in any case."""
-    if option.choice is Choice.WIDE:
+def _excess(option: PassOption, target: ScanTarget, seconds: float, dose: float) -> str:
+    """Which limit of the target an option would exceed, in words; "" if none. Offset views come in any case."""
+    if option.choice is Choice.OFFSET:
         return ""
     seconds, percent = seconds + option.seconds, 100 * (dose + option.dose)
-    if wish.seconds is not None and seconds > wish.seconds:
-        return f"{option.choice} would end the scan after {seconds:.0f} s; the wish allows {wish.seconds:g} s"
-    if wish.dose is not None and percent > 100.0000001 * wish.dose:  # beyond rounding of the sum
+    if target.seconds is not None and seconds > target.seconds:
+        return f"{option.choice} would end the scan after {seconds:.0f} s; the target allows {target.seconds:g} s"
+    if target.dose is not None and percent > 100.0000001 * target.dose:  # beyond rounding of the sum
         return (
-            f"with {option.choice} the scan would take {percent:.3g} % of the plan's dose; the wish allows "
-            f"{100 * wish.dose:g} %"
+            f"with {option.choice} the scan would take {percent:.3g} % of the plan's dose; the target allows "
+            f"{100 * target.dose:g} %"
         )
     return ""

@@ -16,9 +16,14 @@ class Choice(StrEnum):
 
     NEXT = "next"  # the next pass of the plan
     AGAIN = "again"  # the angles of the last pass once more, in place of the last pass still to come
-    WIDE = "wide"  # the wide views of the plan, now
+    OFFSET = "offset"  # the offset views of the plan, now
     RETAKE = "retake"  # views that were flagged, or gave no frame, now
-    ENOUGH = "enough"  # no further pass; wide views of the plan still come, as they set the density
+    ENOUGH = "enough"  # no further pass; offset views of the plan still come, as they set the density
+
+    @classmethod
+    def _missing_(cls, value: object) -> Choice | None:
+        """Files of earlier versions have `wide` for the offset views."""
+        return cls.OFFSET if value == "wide" else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,13 +33,13 @@ class Passes:
     Attributes:
         done: passes of views so far, oldest first; one that was taken again stands there twice.
         to_come: passes of the plan that are still to be taken.
-        wide: blocks of wide views that were not taken yet.
+        offset: blocks of offset views that were not taken yet.
         retakes: views that can be taken again now.
     """
 
     done: tuple[Block, ...]
     to_come: tuple[Block, ...]
-    wide: tuple[Block, ...] = ()
+    offset: tuple[Block, ...] = ()
     retakes: int = 0
 
     @property
@@ -59,8 +64,8 @@ class Passes:
                 return replace(self, done=(*self.done, self.done[-1]), to_come=self.to_come[:-1])
             case Choice.NEXT | Choice.AGAIN:
                 return replace(self, done=(*self.done, *self.to_come[:1]), to_come=self.to_come[1:])
-            case Choice.WIDE:
-                return replace(self, wide=())
+            case Choice.OFFSET:
+                return replace(self, offset=())
             case Choice.ENOUGH:
                 return replace(self, to_come=())
         return self  # retakes are of no pass
@@ -85,7 +90,7 @@ def triggers_to_take(*blocks: Block) -> frozenset[int]:
     return frozenset(i for block in blocks for i in range(block.n) if i not in block.stored)
 
 
-def passes_at_start(views: Block, size: int, choices: Iterable[str], wide: Iterable[Block] = ()) -> Passes:
+def passes_at_start(views: Block, size: int, choices: Iterable[str], offset: Iterable[Block] = ()) -> Passes:
     """The passes of a scan at the end of its first one, or, after these choices, of the one that it resumes.
 
     Its passes are those of the whole plan, also where earlier files have some of their views.
@@ -93,7 +98,7 @@ def passes_at_start(views: Block, size: int, choices: Iterable[str], wide: Itera
     Args:
         size: frames of a pass, as of `pass_blocks`.
     """
-    passes = Passes((), pass_blocks(replace(views, stored=frozenset()), size), (*wide,))
+    passes = Passes((), pass_blocks(replace(views, stored=frozenset()), size), (*offset,))
     for choice in (Choice.NEXT, *choices):
         passes = passes.after(Choice(choice))
     return passes

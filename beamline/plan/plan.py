@@ -52,16 +52,16 @@ class ScanPlan:
         darks, flats: reference frames.
         scheme: how the angles were chosen ("fixed", "golden", ...), for the record.
         retake_share: largest share of the views that are repeated after an alarm of the monitor; 0: none.
-        stored: triggers of views, and after them of wide views, that need not be taken: earlier files of the same scan
+        stored: triggers of views, and after them of offset views, that need not be taken: earlier files of the scan
             have them, or the scan decided against them.
         choices: what earlier files of the same scan chose after each pass that ended in them (`passes.Choice`), oldest
             first. A scan that goes on is in the pass that the last one began.
         choice_due: that pass has ended, and nothing was chosen yet.
         pass_views: views of a pass of a step scan; 0: all. The passes of a fly scan are its trains.
         warm_up: s of light on the scintillator before frames with light, each time the shutter opens.
-        end_references: kinds of references that are still to be taken after the views, where all else but wide views
+        end_references: kinds of references that are still to be taken after the views, where all else but offset views
             is stored. None: all that are planned, before and after the views.
-        wide_views: angles, evenly spread, of one frame each with the sample at each of `wide_places`, in mm aside.
+        offset_views: angles, evenly spread, of one frame each with the sample at each of `offset_places`, in mm aside.
         filter: the place of the filter for all frames; None: as it stands.
         energy: keV of the monochromator for all frames; None: as it stands.
         frames_per_view: of a step scan; the stage neither moves nor settles between them.
@@ -82,8 +82,8 @@ class ScanPlan:
     pass_views: int = 0
     end_references: frozenset[FrameKind] | None = None
     warm_up: float = 0.0
-    wide_views: int = 0
-    wide_places: tuple[float, ...] = ()
+    offset_views: int = 0
+    offset_places: tuple[float, ...] = ()
     filter: str | None = None
     energy: float | None = None
     frames_per_view: int = 1
@@ -319,10 +319,10 @@ def middle_of_exposure(views: Block) -> NDArray[np.float64]:
     return turned
 
 
-def wide_block(views: Block, n: int, aside: float) -> Block:
-    """The block of wide views with the sample `aside`, at `n` evenly spread angles; the stage stands for each."""
+def offset_block(views: Block, n: int, aside: float) -> Block:
+    """The block of offset views with the sample `aside`, at `n` evenly spread angles; the stage stands for each."""
     triggers = np.argsort(views.angles, kind="stable")[np.arange(n) * views.n // n]
-    return replace(retake_block(views, triggers), kind=FrameKind.WIDE_VIEW, aside=aside)
+    return replace(retake_block(views, triggers), kind=FrameKind.OFFSET_VIEW, aside=aside)
 
 
 def retake_block(views: Block, triggers: NDArray[np.int64]) -> Block:

@@ -1,6 +1,6 @@
 """Timeline: a plan computed for one stage and one camera, as values and as lines for the operator.
 
-Darks then flats come before the views; wide views, flats, then darks after them. A fly scan turns at step /
+Darks then flats come before the views; offset views, flats, then darks after them. A fly scan turns at step /
 period, rounded to whole counts a second (the views' block has that period). It starts far enough before the first pulse
 to reach that speed (`taxi_angle`) and goes as far beyond the last. Several passes all go the same way, with a return at
 full speed between them.
@@ -27,9 +27,9 @@ from beamline.plan.plan import (
     Retake,
     ScanPlan,
     Timeline,
+    offset_block,
     retake_block,
     spread_retakes,
-    wide_block,
 )
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraTiming, StageLimits, TriggerTrain
@@ -207,10 +207,10 @@ def _blocks(
     views = _views(plan, flight, row, scale, stage)
     yield views
     row += views.n
-    for mm in plan.wide_places:
-        stored = frozenset(i for i in range(plan.wide_views) if row - views.first_trigger + i in plan.stored)
-        yield replace(wide_block(views, plan.wide_views, mm), first_trigger=row, stored=stored)
-        row += plan.wide_views
+    for mm in plan.offset_places:
+        stored = frozenset(i for i in range(plan.offset_views) if row - views.first_trigger + i in plan.stored)
+        yield replace(offset_block(views, plan.offset_views, mm), first_trigger=row, stored=stored)
+        row += plan.offset_views
     for kind, field in reversed(before):
         if field.count and field.at in (Place.END, Place.BOTH):
             yield _static(kind, field, row, plan, camera, stored=missing is not None and kind not in missing)
@@ -308,13 +308,15 @@ def describe(
         ]
     else:
         facts.append(("moves", f"at {degrees(stage.max_speed)}/s, then {plan.settle:g} s to settle"))
-    if plan.wide_places:
-        facts.append(("wide", f"the sample {', '.join(f'{mm:+.4g}' for mm in plan.wide_places)} mm across the beam"))
+    if plan.offset_places:
+        facts.append(
+            ("offset", f"the sample {', '.join(f'{mm:+.4g}' for mm in plan.offset_places)} mm across the beam")
+        )
     total = size(timeline.total_bytes)
     free = "" if free_bytes is None else f"; {size(free_bytes)} free"
     facts += [
         ("camera", f"{rows} x {cols} px of {camera.bits} bits, least time between triggers {camera.min_period:.6g} s"),
-        ("duration", f"{duration_text(timeline.duration)} (without shutter and sample moves)"),
+        ("duration", f"{hms_text(timeline.duration)} (without shutter and sample moves)"),
         ("size", f"{timeline.n_frames} frames of {size(timeline.frame_bytes)} and previews = {total}{free}"),
     ]
     lines += ["", *(f"{name:<10}{text}" for name, text in facts)]
@@ -328,7 +330,7 @@ def _angles(angles: NDArray[np.float64]) -> str:
     return f"{degrees(float(angles[0]))} ... {degrees(float(angles[-1]))}"
 
 
-def duration_text(seconds: float) -> str:
+def hms_text(seconds: float) -> str:
     """`1:02:03 = 3723.0 s`."""
     whole = round(seconds)
     return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02} = {seconds:.1f} s"

@@ -1,4 +1,4 @@
-"""Consistency: laws that hold for all views of a sample at rest, and light that matches its flats."""
+"""Consistency: conditions that hold for all views of a sample at rest, and light that matches its flats."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ _COMPARED = ("higher", "lower"), ("less absorbing", "more absorbing"), ("narrowe
 
 
 @dataclass(frozen=True)
-class Law:
+class ConsistencyCondition:
     """A consistency condition of all views of a sample at rest, and the residual that the views leave in it.
 
     Attributes:
@@ -95,33 +95,33 @@ def warn_of_inconsistency(prepared: PreparedProjections, selection: ScanSelectio
     known = prepared.measured is None and prepared.projections.floored <= _FLOORED
     if geometry.shifts.any() or not geometry.is_straight or whole.size < _LEAST_VIEWS or not known:
         return {}
-    laws = _laws_of(prepared, whole=selection.asked.rows is None)
-    for law in laws:
-        if law.broken:
-            warn(law.sentence)
-    return {law.name: law.in_words() for law in laws if np.isfinite(law.residual)}
+    conditions = _conditions_of(prepared, whole=selection.asked.rows is None)
+    for condition in conditions:
+        if condition.broken:
+            warn(condition.sentence)
+    return {condition.name: condition.in_words() for condition in conditions if np.isfinite(condition.residual)}
 
 
-def _laws_of(prepared: PreparedProjections, *, whole: bool) -> list[Law]:
-    """The laws that these views have to obey; `whole`: all rows of the detector are there."""
+def _conditions_of(prepared: PreparedProjections, *, whole: bool) -> list[ConsistencyCondition]:
+    """The conditions that these views have to obey; `whole`: all rows of the detector are there."""
     geometry, data = prepared.geometry, prepared.projections.data
     some = spread(np.arange(len(data)), _VIEWS)
     edges, frames = FieldEdges.of(data, geometry), prepared.projections.view_ids
     wide, (faint, air_is_off) = edges.beyond() or edges.passing(), _faint_or_off(data, some)
-    laws = list[Law]()
+    conditions = list[ConsistencyCondition]()
     if geometry.rows_show_slices and not (geometry.is_off_middle and covers_the_circle(geometry.angles)):
         if wide or faint > 1 or air_is_off:
-            laws = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames[some])]
+            conditions = [_steady(data, some, geometry.angles[some], geometry.axis_col, frames[some])]
         elif data.shape[1] >= _LEAST_ROWS and whole:
-            laws = _laws_within_the_field(prepared, some)
+            conditions = _conditions_within_the_field(prepared, some)
     if geometry.is_cone and not wide and covers_the_circle(geometry.angles):
-        laws.append(_lean_of_axis(data, some, geometry))
-    if (wide or not air_is_off) and not any(law.broken for law in laws):
-        laws.append(_at_rest(data, geometry, frames, max(faint, 1.0)))
-    return laws
+        conditions.append(_lean_of_axis(data, some, geometry))
+    if (wide or not air_is_off) and not any(condition.broken for condition in conditions):
+        conditions.append(_at_rest(data, geometry, frames, max(faint, 1.0)))
+    return conditions
 
 
-def _laws_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]) -> list[Law]:
+def _conditions_within_the_field(prepared: PreparedProjections, some: NDArray[np.intp]) -> list[ConsistencyCondition]:
     """Laws of parallel views that show the whole sample, by some of the views."""
     geometry, data = prepared.geometry, prepared.projections.data
     angles, frames = geometry.angles[some], prepared.projections.view_ids[some]
@@ -191,7 +191,9 @@ def _noise_of(prepared: PreparedProjections, views: Sequence[F32]) -> tuple[floa
     return noise * float(np.sqrt(pixels)), noise * slope
 
 
-def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]) -> Law:
+def _steady(
+    data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, frames: NDArray[np.int64]
+) -> ConsistencyCondition:
     """Views half a turn apart are mirror images, where no air tells of the light."""
     reach = int(min(axis_col, data.shape[2] - 1 - axis_col))
     around = slice(round(axis_col) - reach, round(axis_col) + reach + 1)
@@ -215,7 +217,7 @@ def _steady(data: F32, some: NDArray[np.intp], angles: F64, axis_col: float, fra
         f"{what}, and no air beside the sample corrects it: light, exposure, energy or filter changed, or views of "
         "another scan are among them. Choose views that belong together with --views, or say which columns are air."
     )
-    return Law("light of opposite views", size, _STEP_OF_LIGHT, "of line integral", sentence)
+    return ConsistencyCondition("light of opposite views", size, _STEP_OF_LIGHT, "of line integral", sentence)
 
 
 def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
@@ -230,7 +232,7 @@ def _out_of_line(levels: F64, angles: F64) -> tuple[int, float]:
     return int(order[off.argmax() + 2]), float(off.max())
 
 
-def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: float) -> Law:
+def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: float) -> ConsistencyCondition:
     """One mass in all views, but for what hardening makes of the longer side of a sample, twice a turn."""
     parts = np.column_stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)])
     rest = shown.mass - parts @ np.linalg.lstsq(parts, shown.mass, rcond=None)[0]
@@ -246,18 +248,18 @@ def _masses(shown: ViewMoments, angles: F64, frames: NDArray[np.int64], noise: f
             f"{most:+.1%} matter beside the others, at most, {because}: something else stood in the beam, or the light "
             "is wrong. Look at them; --views leaves them out."
         )
-        return Law("mass of the views", float(abs(most)), limit, "of the mass", sentence)
+        return ConsistencyCondition("mass of the views", float(abs(most)), limit, "of the mass", sentence)
     sentence = (
         f"The mass of the views changes by {np.ptp(np.percentile(shown.mass, _TENTHS)):.0%}, {because}: it is least "
         f"in frame {frames[shown.mass.argmin()]} and greatest in frame {frames[shown.mass.argmax()]}. Did the energy "
         "or the sample change within the scan, or are views of another scan, exposure or reference among them? Choose "
-        "views that belong together with --views (every:2, where two lights take turns); --time where the sample "
+        "views that belong together with --views (every:2, where two lights take turns); --volumes where the sample "
         "changes."
     )
-    return Law("mass of the views", float(high - low), tolerance, "of the mass", sentence)
+    return ConsistencyCondition("mass of the views", float(high - low), tolerance, "of the mass", sentence)
 
 
-def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Law:
+def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
     """The law that the mean view of a full turn is its own mirror image about the axis, in a cone, too."""
     weights = circle_weights(geometry.angles[some]) / (2 * math.pi)
     mean = np.zeros(data.shape[1:])
@@ -265,41 +267,41 @@ def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Law:
         mean += weight * data[view]
     roll, sigma = roll_of_mean_view(mean, geometry.axis_col)
     if math.isnan(sigma):
-        return Law("mirror images of a turn", math.nan, MATTERS, "px of lean", "")
+        return ConsistencyCondition("mirror images of a turn", math.nan, MATTERS, "px of lean", "")
     rows, least = len(mean), max(MATTERS, _SURE * sigma * len(mean))
     sentence = (
         f"The rotation axis seems to lean by {tilt_text(roll, sigma)} in the detector's plane, {abs(roll) * rows:.1f} "
         f"px over {rows} rows: edges double in the first and last slices. Give --calibrate axis,roll with an iterative "
         "method, such as -m fista-tv."
     )
-    return Law("mirror images of a turn", abs(roll) * rows, least, "px of lean", sentence)
+    return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of lean", sentence)
 
 
-def _across(shown: ViewMoments) -> Law:
+def _across(shown: ViewMoments) -> ConsistencyCondition:
     left, right = np.percentile(shown.across, _MOST_OF_THEM)
     sentence = (
         f"The centre of mass leaves its way about the axis by {right - left:.1f} columns, from one view to another "
         f"(uncertain by {shown.across_sigma:.2g}): the sample or the stage moved across, or frames are not those of "
-        "their angles. Give --calibrate shifts, or --poses; --time where the sample changes."
+        "their angles. Give --calibrate shifts, or --poses; --volumes where the sample changes."
     )
     tolerance = max(_ACROSS, 2 * _NOISE * shown.across_sigma)
-    return Law("centre of mass on a sine", float(right - left), tolerance, "columns", sentence)
+    return ConsistencyCondition("centre of mass on a sine", float(right - left), tolerance, "columns", sentence)
 
 
-def _heights(shown: ViewMoments) -> Law:
+def _heights(shown: ViewMoments) -> ConsistencyCondition:
     low, high = np.percentile(shown.down, _MOST_OF_THEM)
     sentence = (
         f"From view to view the matter stands up to {high - low:.1f} rows higher or lower (from {shown.down[0]:+.1f} "
         f"rows in the first view to {shown.down[-1]:+.1f} in the last; uncertain by {shown.down_sigma:.2g}), where "
         "each row of a sample at rest holds one mass in all views: slices are blurred across rows. Give --calibrate "
-        "shifts where the sample or the stage moved, or --poses; --time where the sample changes."
+        "shifts where the sample or the stage moved, or --poses; --volumes where the sample changes."
     )
     known = np.isfinite([*shown.down, shown.down_sigma]).all()
     tolerance = max(_HALF_A_PIXEL, 2 * _NOISE * shown.down_sigma)
-    return Law("mass of each row", float(high - low) if known else np.nan, tolerance, "rows", sentence)
+    return ConsistencyCondition("mass of each row", float(high - low) if known else np.nan, tolerance, "rows", sentence)
 
 
-def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> Law:
+def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> ConsistencyCondition:
     span = float(np.degrees(np.ptp(angles)))
     sentence = (
         f"The views seem to turn by {span * (1 + shown.stretch):.4g} degrees, and are stated to turn by {span:.4g} "
@@ -308,7 +310,9 @@ def _angles(shown: ViewMoments, angles: NDArray[np.floating]) -> Law:
         "--angles FILE (degrees, one a line), or compare slices made with them."
     )
     tolerance = max(_STRETCH, _SURE * shown.stretch_sigma)
-    return Law("moments, scale of the angles", abs(shown.stretch), tolerance, "of the angles", sentence)
+    return ConsistencyCondition(
+        "moments, scale of the angles", abs(shown.stretch), tolerance, "of the angles", sentence
+    )
 
 
 def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
@@ -336,7 +340,7 @@ def _ends_of_turn(data: F32, geometry: Geometry, stretch: float) -> str:
     )
 
 
-def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: float) -> Law:
+def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: float) -> ConsistencyCondition:
     """Views of the same rays, early and late, show one sample, in any beam and however wide it is.
 
     Args:
@@ -353,7 +357,7 @@ def _at_rest(data: F32, geometry: Geometry, frames: NDArray[np.int64], faint: fl
                 f"Frames {frames[first]} and {frames[later]}, as others that see the same rays at two times, show "
                 f"another sample: it becomes {', '.join(np.array(words)[off > 1])}"
                 f"{_SCALED if off[2] > 1 and change[2] * change[3] > 0 else ''}. One volume blurs what changes: "
-                "give --time N for several in time, --calibrate shifts where the sample moved as a whole, or --views "
-                "for a part of the scan."
+                "give --volumes N for several in time, --calibrate shifts where the sample moved as a whole, or "
+                "--views for a part of the scan."
             )
-    return Law("views of the same rays", worst, 1.0, "of the least change that is reported", sentence)
+    return ConsistencyCondition("views of the same rays", worst, 1.0, "of the least change that is reported", sentence)

@@ -153,7 +153,7 @@ def require_usable(source: ScanSource, selection: Selection) -> None:
 
 
 def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
-    """The usable views, their stated poses, and rows of wide views; refuses what is wrong before any frame is read."""
+    """The usable views, their stated poses, and rows of offset views; refuses faults before any frame is read."""
     source = scan.source
     usable = checked_views(scan, selection, warn)
     warn_of_units(source, selection, warn)
@@ -165,7 +165,7 @@ def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[U
         require_stated(poses, source, usable.frames[first])
         aside = np.abs((cols := poses.shifts[usable.frames, 0]) - np.nanmedian(cols)) > source.shape[1] / 2
         return replace(usable, frames=usable.frames[~aside]), poses, usable.frames[aside]
-    return usable, poses, source.table.wide_views
+    return usable, poses, source.table.offset_views
 
 
 def _chosen(

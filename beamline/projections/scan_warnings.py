@@ -58,7 +58,7 @@ def warn_of_the_field(scan: ScanEvidence, selection: ScanSelection, prepared: Pr
         if unlevelled and scan.in_counts and selection.step(Air).model != "none":
             light = without_air(scan, edges.mean)
         continued = edges.continued and has_direct_method(geometry)
-        wide = not geometry.is_centred.all() or bool(scan.table.wide_views.size)
+        wide = not geometry.is_centred.all() or bool(scan.table.offset_views.size)
         warn(f"{cut_sentence(sides, continued, wide)} {light}".rstrip())
         if unlevelled and (change := uncorrected_current(scan, selection)):
             warn(change)
@@ -68,11 +68,11 @@ def warn_of_the_field(scan: ScanEvidence, selection: ScanSelection, prepared: Pr
 
 def cut_sentence(sides: dict[str, float], continued: bool, wide: bool) -> str:
     """The warning that the sample extends beyond the field of view, by `FieldEdges.beyond`; `continued`: by FBP,
-    `wide`: the scan has wide views."""
+    `wide`: the scan has offset views."""
     fbp = "FBP continues the views, with densities off by tens of per cent; other" if continued else "Iterative"
     advice = (
-        "Wide views (scan.wide_views, some 8 to 16 exposures more) or a full turn with the axis near an edge (twice "
-        "the views) show the rest. "
+        "Offset views (scan.offset_views, some 8 to 16 exposures more) or a full turn with the axis near an edge "
+        "(twice the views) show the rest. "
     )
     return (
         f"{beyond_the_field(sides)} {fbp} methods reconstruct the sample as wide as it is. {'' if wide else advice}The "

@@ -220,7 +220,7 @@ class PassLaws:
         except (ValueError, DataError, MemoryError) as error:
             self._no_law(ends.size, rows.size, str(error) or "the memory does not suffice")
             return
-        if (self._views.source.table.wide_views < end).any() and law.offset < 1:
+        if (self._views.source.table.offset_views < end).any() and law.offset < 1:
             law = replace(law, noise=law.noise / (1 - law.offset), offset=0.0)
         self._warn.withdraw(_NO_GAIN)
         self._sink(LawMeasured(ends.size, **vars(law), gained=gained, time=self._clock.now()))

@@ -56,7 +56,7 @@ _OUTDATED = (
 )
 _NEXT_PART = "Views of the next part of the run begin: all views are corrected again, each by the flats of its own part"
 _SEVERAL_PARTS = "The run has several parts: at its end all views are corrected again, in one piece"
-_WIDE = "The volume takes the wide views of its scan, too: all views are corrected again, with these"
+_OFFSET = "The volume takes the offset views of its scan, too: all views are corrected again, with these"
 _SHADED = "Something stands in the beam of all views, though not of the flats: all views are corrected again without it"
 
 
@@ -101,7 +101,7 @@ class ScanFollower:
 
     @property
     def has_volume(self) -> bool:
-        """Whether there is a model with enough views for a volume, should the fit stop now."""
+        """Whether the fit has taken enough views to give a volume if it stops now."""
         return self._fit is not None and self._fit.started and self.n_views_taken >= _LEAST_VIEWS
 
     def take_new_frames(self, ended: bool) -> bool:
@@ -330,9 +330,9 @@ class ScanFollower:
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
                 "`beamline recon` on the finished file leaves out the views of the shorter side."
             )
-        wide = self.source.table.wide_views
+        wide = self.source.table.offset_views
         parts = self.source.table.part_starts.size
-        why = _SEVERAL_PARTS if parts > 1 else _OUTDATED if self._correction.outdated else _WIDE
+        why = _SEVERAL_PARTS if parts > 1 else _OUTDATED if self._correction.outdated else _OFFSET
         self.correct_again(usable, why, wide)
         return self._prepared(self.axis_col, usable)
 

@@ -120,7 +120,7 @@ def selection_around(source: ScanSource, selection: Selection, region: Region, h
 
 
 def locate(region: Region, selection: Selection, geometry: Geometry) -> RegionOfRows:
-    """The position of the region in the volume of `geometry`, made from the selection of `selection_around`.
+    """Where the region lies in the volume of `geometry`, the geometry of what `selection_around` selects.
 
     Raises:
         ConfigError: it lies outside.

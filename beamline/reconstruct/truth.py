@@ -35,6 +35,8 @@ def read_truth(spec: str) -> NDArray[np.float32]:
         data, _ = whole_volume(path, _volume_in(path))
     except DataError as error:
         raise DataError(f"--truth {path} contains no readable volume: {error}") from error
+    if data.ndim != 3:
+        raise DataError(f"--truth {path} is an array of shape {data.shape}; expected a volume [z, y, x].")
     first, end = int(match["first"] or 0), int(match["end"] or data.shape[0])
     if not 0 <= first < end <= data.shape[0]:
         raise ConfigError(f"--truth {spec}: slices {first}:{end} do not lie in 0:{data.shape[0]}.")

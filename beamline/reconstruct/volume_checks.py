@@ -139,7 +139,7 @@ def _sample_radius(made: Reconstruction, prepared: PreparedProjections) -> str:
         known = "assumed: there are too few views to measure it"
     elif low < high:
         known = f"{low:.4g} to {high:.4g} {unit} explain the views nearly as well"
-        advice = "; wide views (scan.wide_views) reduce that" if prepared.geometry.is_centred.all() else ""
+        advice = "; offset views (scan.offset_views) reduce that" if prepared.geometry.is_centred.all() else ""
         sure = f" Densities near the axis are uncertain by {density:.1%} or more{advice}."
     return Note(
         f"The sample reaches {radius:.4g} {unit} from the rotation axis, {radius / reach:.2f} times as far as the "

@@ -127,11 +127,11 @@ class Acquisition:
             if views and (refused := self._supervision.refusal()):
                 self._refused = refused
                 return
-            # Wide views may be taken already, where they were chosen after a pass.
+            # Offset views may be taken already, where they were chosen after a pass.
             if any(t.block is block for t in self._done) or (self._stop.stopping and not self._still_needed(block)):
                 continue
-            if block.kind is FrameKind.WIDE_VIEW:
-                yield from self._wide(block)
+            if block.kind is FrameKind.OFFSET_VIEW:
+                yield from self._offset(block)
             elif block.kind is FrameKind.PROJECTION and self._supervision.next_pass is not None:
                 enough = yield from self._pass_by_pass(block, self._supervision.next_pass)
             else:
@@ -147,11 +147,11 @@ class Acquisition:
         Where that pass had ended, it does not end anew, and the choice comes next.
         """
         plan, blocks = self._timeline.plan, [block for block in self._timeline.blocks if block.n_to_take]
-        wide = [block for block in blocks if block.kind is FrameKind.WIDE_VIEW]
-        passes = passes_at_start(views, plan.pass_views * plan.frames_per_view, plan.choices, wide)
+        offset = [block for block in blocks if block.kind is FrameKind.OFFSET_VIEW]
+        passes = passes_at_start(views, plan.pass_views * plan.frames_per_view, plan.choices, offset)
         choice, ended_before = Choice((Choice.NEXT, *plan.choices)[-1]), plan.choice_due
         unfinished = replace(views, stored=frozenset(range(views.n)) - triggers_to_take(*passes.done) | views.stored)
-        blocks = [*([unfinished] if unfinished.n_to_take else []), *(wide if choice is Choice.WIDE else [])]
+        blocks = [*([unfinished] if unfinished.n_to_take else []), *(offset if choice is Choice.OFFSET else [])]
         if not self._done:  # no references came first, and the choice may
             self._done.append(BlockTally(replace(views, stored=frozenset(range(views.n)))))
             self._supervision.states.enter(_state_of(views))
@@ -161,7 +161,7 @@ class Acquisition:
                 if self._stop.stopping:
                     return False
                 taken = BlockTally(block, again)
-                yield from self._wide(block) if block.kind is FrameKind.WIDE_VIEW else self._block(taken)
+                yield from self._offset(block) if block.kind is FrameKind.OFFSET_VIEW else self._block(taken)
                 self.recovered += recover(self._done, taken.rows)
             if choice is Choice.RETAKE:
                 yield from self._retake(views)
@@ -179,7 +179,7 @@ class Acquisition:
             if self._stop.stopping or (choice is Choice.NEXT and not passes.to_come):
                 return False
             before, passes = passes, passes.after(choice)
-            blocks = [*passes.done[len(before.done) :], *before.wide[len(passes.wide) :]]
+            blocks = [*passes.done[len(before.done) :], *before.offset[len(passes.offset) :]]
 
     def _block(self, taken: BlockTally) -> Iterator[Frame]:
         block = taken.block
@@ -222,11 +222,11 @@ class Acquisition:
         if rows := [retakes[i].row for i in taken.missing if retakes[i].row >= 0]:
             self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were repeated."))
 
-    def _wide(self, block: Block) -> Iterator[Frame]:
-        """Wide views, at angles of the first views. Nothing replaces anything."""
+    def _offset(self, block: Block) -> Iterator[Frame]:
+        """Offset views, at angles of the first views. Nothing replaces anything."""
         views = self._timeline.views
         beyond = float(max(middle_of_exposure(views), key=abs))  # every pass goes the same way; one pulse has none
-        first = block.first_trigger - views.first_trigger  # in files wide views are views, too
+        first = block.first_trigger - views.first_trigger  # in files offset views are views, too
         for frame in self._block(BlockTally(block)):
             invalid = frame.kind is FrameKind.INVALID
             yield frame if invalid else replace(frame, angle=frame.angle - beyond, trigger=first + frame.trigger)

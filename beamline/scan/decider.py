@@ -13,7 +13,7 @@ from typing import Any
 from beamline.core.events import NextChosen, PassEnded, Sink, Warned
 from beamline.core.recon_events import LawMeasured
 from beamline.core.stop import StopRequest
-from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, remaining_gain
+from beamline.plan.choose import PassOption, ScanTarget, choose, frame_dose, next_is_sure, options, remaining_gain
 from beamline.plan.passes import Choice, Passes
 from beamline.plan.plan import Block, Timeline
 from beamline.scan.control import State, StateMachine
@@ -45,7 +45,7 @@ class Decider:
     """
 
     asks: bool
-    wish: Wish
+    target: ScanTarget
     wait: float
     timeline: Timeline
     seconds_of: Callable[[Block], float]
@@ -94,7 +94,7 @@ class Decider:
             return Choice.NEXT
         if law is not None:
             spent = self._spent(passes)
-            by, (choice, reason) = "program", choose(offered, self.wish, remaining_gain(passes, law), *spent)
+            by, (choice, reason) = "program", choose(offered, self.target, remaining_gain(passes, law), *spent)
         else:
             by, choice, self._no_more_laws = "plan", Choice.NEXT, self.why_no_law()
             reason = (
@@ -131,7 +131,7 @@ class Decider:
             law is None
             or self.asks
             or self.why_no_law()
-            or not next_is_sure(passes, offered, self.wish, law, *self._spent(passes))
+            or not next_is_sure(passes, offered, self.target, law, *self._spent(passes))
         ):
             if not self._law_has_come():
                 self.close_shutter()  # a law takes seconds
@@ -157,9 +157,9 @@ class Decider:
     def _spent(self, passes: Passes) -> tuple[float, float]:
         """Seconds and share of the dose that the scan has taken, with what follows the passes in any case."""
         retaken = sum(option["frames"] for option in self._chosen.values() if option.get("choice") is Choice.RETAKE)
-        wide = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
-        seconds = max(0.0, self.now() - self.began) + self.added_seconds + sum(map(self.seconds_of, passes.wide))
-        return seconds, (passes.n_frames + self.retaken + retaken + wide) * frame_dose(self.timeline)
+        offset = sum(block.n for block in self.timeline.blocks if block.kind is FrameKind.OFFSET_VIEW)
+        seconds = max(0.0, self.now() - self.began) + self.added_seconds + sum(map(self.seconds_of, passes.offset))
+        return seconds, (passes.n_frames + self.retaken + retaken + offset) * frame_dose(self.timeline)
 
     def _wait(self, until: Callable[[], bool], at_enter: Callable[[], None] = lambda: None) -> None:
         """Wait until this is so, but `wait` s at most, and not beyond a stop."""

@@ -49,7 +49,7 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
         options["--bin"] = plan.binning
     if plan.every > 1:
         options["--views"] = f"every:{plan.every}"
-    flags = ["--follow", *(word for part in earlier for word in ("--earlier", str(part)))]
+    flags = ["--follow", *(word for part in earlier for word in ("--previous-part", str(part)))]
     return lambda scan, output: _words(scan, flags, {**options, "-o": output})
 
 

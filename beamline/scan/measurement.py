@@ -18,7 +18,7 @@ from beamline.core.run_result import RunResult
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.core.text import count
 from beamline.instrument.connect import ConnectedDevices, enter_pressed
-from beamline.plan.choose import Wish
+from beamline.plan.choose import ScanTarget
 from beamline.plan.plan import Block, Retake, spread_retakes
 from beamline.plan.timeline import block_seconds
 from beamline.scan.acquisition import Acquisition
@@ -81,7 +81,7 @@ class Measurement:
         after = timeline.blocks[timeline.blocks.index(timeline.views) :]
         return Decider(
             asks=scan.decide == "ask",
-            wish=Wish(**dict(scan.wish)),
+            target=ScanTarget(**dict(scan.target)),
             wait=scan.wait_s,
             timeline=timeline,
             seconds_of=seconds_of,

@@ -29,7 +29,7 @@ from beamline.monitor.watch import start as start_monitor
 from beamline.plan.limits import ROOM
 from beamline.plan.plan import Mode, ScanPlan, Timeline
 from beamline.plan.timeline import describe as describe_timeline
-from beamline.plan.timeline import duration_text, work_out
+from beamline.plan.timeline import hms_text, work_out
 from beamline.scan.live_plan import better_order, live_need
 from beamline.storage.writer_lock import no_locks
 from beamline.storage.writers.nxtomo import ScanInfo
@@ -79,7 +79,7 @@ class DryRun:
             seconds = sum(need.duration for need in each)
             sentence = (
                 f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, a scan like this of each: "
-                f"{duration_text(seconds)} and {size(self.total_bytes)} in all (without the monochromator's moves)"
+                f"{hms_text(seconds)} and {size(self.total_bytes)} in all (without the monochromator's moves)"
             )
             lines.append(f"{'energies':<10}{sentence}")
         return lines
@@ -313,7 +313,7 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         "settle_s": plan.settle,
         "warm_up_s": plan.warm_up,
         **({"frames_per_view": plan.frames_per_view} if plan.frames_per_view > 1 else {}),
-        **({"wide_views": plan.wide_views, "wide_places_mm": plan.wide_places} if plan.wide_places else {}),
+        **({"offset_views": plan.offset_views, "offset_places_mm": plan.offset_places} if plan.offset_places else {}),
         "darks": {"count": plan.darks.count, "at": plan.darks.at, "exposure_s": plan.darks.exposure},
         "flats": {"count": plan.flats.count, "at": plan.flats.at, "exposure_s": plan.flats.exposure},
         "angles_deg": np.degrees(plan.angles).tolist(),
@@ -325,7 +325,7 @@ def _info(config: Config, instrument: ConnectedDevices, plan: ScanPlan, timeline
         exposure=plan.exposure,
         period=timeline.views.period,
         plan=json_of(asked),
-        wide_views=bool(plan.wide_places),
+        offset_views=bool(plan.offset_places),
         decides=config.scan.decide != "off",
         filter=plan.filter or known.filter,
         energy_kev=plan.energy or known.energy_kev,

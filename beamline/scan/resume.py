@@ -23,14 +23,14 @@ from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.runs import end_record
 from beamline.storage import datasets, hdf5
-from beamline.storage.interrupted import n_still_to_take, still_to_take, wide_taken
+from beamline.storage.interrupted import n_still_to_take, offset_taken, still_to_take
 from beamline.storage.parts import (
     end_references_missing,
     files_with_frames,
     is_joined,
     join,
+    offset_planned,
     views_planned,
-    wide_planned,
 )
 from beamline.storage.recorded_frames import frames_in
 from beamline.storage.recover import Recovered, recover, require_ours
@@ -57,7 +57,7 @@ class ResumableRun:
         parts: its files so far, each with a frame at least.
         views: of the plan, in these files, or decided against.
         planned: views of the whole plan.
-        wide: triggers of the wide views in these files; wide_missing: how many the plan still has.
+        offset: triggers of the offset views in these files; offset_missing: how many the plan still has.
         choices: after each pass that ended in them, oldest first.
         choice_due: the last one ended, and nothing was chosen yet.
         seconds: that they took, from the first frame of each to its last one.
@@ -76,8 +76,8 @@ class ResumableRun:
     last_frame_time: float
     left_out: tuple[str, ...] = ()
     end_references: frozenset[FrameKind] | None = None
-    wide: frozenset[int] = frozenset()
-    wide_missing: int = 0
+    offset: frozenset[int] = frozenset()
+    offset_missing: int = 0
     choices: tuple[str, ...] = ()
     choice_due: bool = False
     seconds: float = 0.0
@@ -88,7 +88,7 @@ class ResumableRun:
         """The run in one line for people."""
         missing = self.planned - len(self.views)
         if self.end_references is not None:
-            kinds = ["wide views"] if self.wide_missing else []
+            kinds = ["offset views"] if self.offset_missing else []
             kinds += [f"{kind.name.lower()}s" for kind in sorted(self.end_references)]
             all_views = "the views that it was to take" if self.choices else f"{self.planned} views"
             return (
@@ -100,7 +100,7 @@ class ResumableRun:
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
         """The part of the plan that is still missing."""
-        stored = self.views | self.wide
+        stored = self.views | self.offset
         references = self.end_references
         return replace(plan, stored=stored, choices=self.choices, choice_due=self.choice_due, end_references=references)
 
@@ -206,15 +206,15 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     with ExitStack() as opened, hdf5.readable(run):
         each = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         missing, choices, due = still_to_take(each)
-        wide = wide_taken(each)
-        wide_missing = wide_planned(each[0]) - len(wide)
+        offset = offset_taken(each)
+        offset_missing = offset_planned(each[0]) - len(offset)
         end_references = None if missing else end_references_missing(each)
-    if not (missing or wide_missing or end_references):
+    if not (missing or offset_missing or end_references):
         _refuse_whole(run, parts, closed)
     last, seconds = max(float(part.max()) for part in times), sum(float(np.ptp(part)) for part in times)
     return ResumableRun(
         run, lock, config, tuple(parts), frozenset(range(planned)) - missing, planned, last, tuple(left_out),
-        end_references, wide, wide_missing, choices, due, seconds, retaken,
+        end_references, offset, offset_missing, choices, due, seconds, retaken,
     )  # fmt: skip
 
 

@@ -95,7 +95,7 @@ def run_scan(
             stack.enter_context(verbs_taken(folder, stop, pause, measurement.decider.answer))
             guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
             if config.simulation is None:
-                without = pause if config.scan.without_watchdog == "pause" else None
+                without = pause if config.scan.on_watchdog_loss == "pause" else None
                 guarded.enter_context(watched(folder, sink, stop, without))
             guarded.callback(connected.close)
             return _to_its_end(measurement, live, afterwards, guarded.close)

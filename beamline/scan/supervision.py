@@ -48,8 +48,8 @@ class Supervision:
     # wait_for_beam_reading: called after the last frame of flats and views: returns when it is known whether there was
     # beam
     wait_for_beam_reading: Callable[[], None] = lambda: None
-    # next_pass: called after each pass of views, wide views or retakes, if something is left, and returns a choice that
-    # is possible. It may take its time, and close the shutter, which the next frames open. None: nothing is chosen
+    # next_pass: called after each pass of views, offset views or retakes, if something is left; returns a possible
+    # choice. It may take its time, and close the shutter, which the next frames open. None: nothing is chosen
     next_pass: Callable[[Passes], Choice] | None = None
     # pass_ended: called before `next_pass`, and after the last pass, too; all frames were delivered
     pass_ended: Callable[[], None] = lambda: None

@@ -103,9 +103,9 @@ class FrameTable:
         return self.of_kind(FrameKind.FLAT)
 
     @cached_property
-    def wide_views(self) -> I64:
+    def offset_views(self) -> I64:
         """Rows of the projections with the sample aside."""
-        return self.of_kind(FrameKind.WIDE_VIEW)
+        return self.of_kind(FrameKind.OFFSET_VIEW)
 
     @cached_property
     def views_with_angles(self) -> I64:

@@ -22,10 +22,10 @@ from beamline.storage import hdf5
 from beamline.storage.parts import (
     files_with_frames,
     joined_file_of,
+    offset_planned,
     plan_in,
     to_join,
     views_planned,
-    wide_planned,
 )
 from beamline.storage.recorded_frames import decisions_in, frames_in
 from beamline.storage.run_record import DIED, alive, read_record
@@ -143,7 +143,7 @@ def _lacks_views(run: Path) -> bool:
     """Whether the files of a run, all closed, lack views that it was to take, wide ones included."""
     with suppress(DataError, *hdf5.ALTERED), ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in files_with_frames(run)]
-        return bool(still_to_take(files)[0]) or wide_planned(files[0]) > len(wide_taken(files))
+        return bool(still_to_take(files)[0]) or offset_planned(files[0]) > len(offset_taken(files))
     return False
 
 
@@ -183,9 +183,9 @@ def n_still_to_take(file: h5py.File) -> int | None:
     return None
 
 
-def wide_taken(files: Sequence[h5py.File]) -> frozenset[int]:
-    """Triggers of the wide views in the files of a scan."""
-    return frozenset[int]().union(*(frames_in(file).numbers_taken(kind=FrameKind.WIDE_VIEW) for file in files))
+def offset_taken(files: Sequence[h5py.File]) -> frozenset[int]:
+    """Triggers of the offset views in the files of a scan."""
+    return frozenset[int]().union(*(frames_in(file).numbers_taken(kind=FrameKind.OFFSET_VIEW) for file in files))
 
 
 def _passes_of(file: h5py.File, choices: Iterable[str]) -> Passes:

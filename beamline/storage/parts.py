@@ -46,10 +46,11 @@ def views_planned(file: h5py.File) -> int | None:
     return None if angles is None else len(angles)
 
 
-def wide_planned(file: h5py.File) -> int:
-    """Number of planned wide views of the scan."""
+def offset_planned(file: h5py.File) -> int:
+    """Number of planned offset views of the scan."""
     plan = plan_in(file)
-    return int(plan.get("wide_views", 0)) * len(plan.get("wide_places_mm", ()))
+    kind = "wide" if "wide_views" in plan else "offset"  # the name in files of earlier versions
+    return int(plan.get(f"{kind}_views", 0)) * len(plan.get(f"{kind}_places_mm", ()))
 
 
 def plan_in(file: h5py.File) -> dict[str, Any]:
@@ -69,7 +70,7 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
     references = table.of_kind(FrameKind.DARK, FrameKind.FLAT)
     first = references[references < views[0]].max(initial=-1) + 1
     seen = table.triggers[first : views[-1] + 1]
-    seen = seen[seen < (views_planned(file) or 0)]  # wide views, and those taken again, count on from there
+    seen = seen[seen < (views_planned(file) or 0)]  # offset views, and those taken again, count on from there
     gaps = np.setdiff1d(np.arange(seen.max(initial=0)), seen)
     return tuple((sum(_planned(file, "start").values()) + gaps).tolist())
 

@@ -25,7 +25,7 @@ _RECORD = np.dtype([(path, layout.COLUMNS[path][0]) for path in layout.RECORDED]
 def frames_in(file: h5py.File, n: int | None = None) -> FrameTable:
     """What the log says of the first n frames, without flags.
 
-    Alignment frames aside are wide views; frames whose record differs from its checksum are INVALID.
+    Alignment frames aside are offset views; frames whose record differs from its checksum are INVALID.
 
     Args:
         n: None: those that are committed.
@@ -39,7 +39,7 @@ def frames_in(file: h5py.File, n: int | None = None) -> FrameTable:
     kinds[~np.isin(kinds, list(FrameKind))] = FrameKind.INVALID
     if layout.X_TRANSLATION in file:
         aside = _column(file, layout.X_TRANSLATION, n)
-        kinds[(kinds == FrameKind.ALIGNMENT) & (aside != 0)] = FrameKind.WIDE_VIEW
+        kinds[(kinds == FrameKind.ALIGNMENT) & (aside != 0)] = FrameKind.OFFSET_VIEW
     kinds[altered] = FrameKind.INVALID
     for path in (layout.TRIGGER, layout.FRAMESTAMP, layout.REPLACES):
         columns[path][altered] = -1
@@ -90,9 +90,9 @@ def _list_in(file: h5py.File, path: str) -> Sequence[Any]:
 
 def image_key_of(kind: FrameKind) -> int:
     """NXtomo's image key of a kind of frame. NXtomo has no key for alignment frames: programs that do not know them
-    must not use them. A wide view is a projection, of a translated sample.
+    must not use them. An offset view is a projection, of a translated sample.
     """
-    return int({FrameKind.ALIGNMENT: FrameKind.INVALID, FrameKind.WIDE_VIEW: FrameKind.PROJECTION}.get(kind, kind))
+    return int({FrameKind.ALIGNMENT: FrameKind.INVALID, FrameKind.OFFSET_VIEW: FrameKind.PROJECTION}.get(kind, kind))
 
 
 def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:

@@ -29,8 +29,11 @@ _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5p
 
 
 def require_harmless(file: h5py.File) -> None:
-    """Raise DataError for a file with more objects or deeper groups than any scan has, for one that refers to a path
-    that is no regular file, that claims more data than it has, or whose values lie in another file as plain bytes."""
+    """Raise DataError for a file that it is not safe to read.
+
+    It has more objects or deeper groups than any scan, refers to a path that is no regular file, claims more data than
+    it has, or its values lie in another file as plain bytes.
+    """
     path = Path(file.filename)
     for name in dict.fromkeys(_names(file, path)):
         # Where HDF5 looks for it: as it is named, beside this file, and by its last part beside it.

@@ -17,7 +17,7 @@ class FrameKind(IntEnum):
     DARK = 2
     INVALID = 3
     ALIGNMENT = -1
-    WIDE_VIEW = -2  # a projection with the sample stepped aside; in files a projection with a translation
+    OFFSET_VIEW = -2  # a projection with the sample stepped aside; in files a projection with a translation
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,9 +1,9 @@
 """Error law: how the error of a volume falls with further views, and the gain in dB that follows for each kind.
 
 The mean square error of a volume of n views has three parts, which are stated as shares of it. `offset` is a constant
-in the middle of the volume, by an unknown density beside the field, and falls only with wide views. `noise` falls with
-the light, also at the same angles. The third part, the remaining share, is by gaps between the angles. The last two
-together fall as n^-exponent with views at new angles.
+in the middle of the volume, by an unknown density beside the field, and falls only with offset views. `noise` falls
+with the light, also at the same angles. The third part, the remaining share, is by gaps between the angles. The last
+two together fall as n^-exponent with views at new angles.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class ErrorLaw:
     offset: float = 0.0
 
     def gain(self, views: int = 0, again: int = 0, wide: bool = False) -> Gain:
-        """Gain in dB of PSNR by further views: at new angles, at the same angles again, and by wide views."""
+        """Gain in dB of PSNR by further views: at new angles, at the same angles again, and by offset views."""
 
         def decibels(factor: float) -> float:  # with the exponent and the shares times this factor
             noise = min(factor * self.noise, 1 - self.offset)

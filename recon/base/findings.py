@@ -9,13 +9,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 from recon.base.registry import ADD_ONS, add_on_missing, did_you_mean
+from recon.base.setting import Setting
 
 KeyPath = tuple[str | int, ...]
 Schema = Mapping[str, Any]
 _OF_VALIDATOR = "Value error, "  # before the message of a validator of ours
+_BOUNDS = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}  # in JSON schemas
 _MANY = 2  # unknown keys of a group: more are those of another kind
 
 
@@ -180,9 +182,8 @@ def _words(branch: Schema) -> str:
     kind = str(branch.get("type"))
     if kind in ("number", "integer"):
         text = "a whole number" if kind == "integer" else "a number"
-        bounds = [("exclusiveMinimum", ">"), ("minimum", ">="), ("exclusiveMaximum", "<"), ("maximum", "<=")]
-        limits = " and ".join(f"{sign} {branch[name]:g}" for name, sign in bounds if name in branch)
-        return f"{text} {limits}".strip()
+        given = {name: float(branch[key]) for name, key in _BOUNDS.items() if key in branch}
+        return f"{text} {Setting(**cast(Any, given)).words}".strip()
     if kind == "array" and "items" in branch:
         return f"a list of {branch.get('minItems', 0)} or more: {_words(branch['items'])}"
     if kind == "array":

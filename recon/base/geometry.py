@@ -230,7 +230,7 @@ class Geometry:
 
     @property
     def is_centred(self) -> NDArray[np.bool_]:
-        """[view] which views are no wide views: those show the sample stepped aside by more than half a field."""
+        """[view] which views are no offset views: those show the sample stepped aside by more than half a field."""
         aside = self.shifts[:, 0]
         usual = np.sort(aside)[(aside.size - 1) // 2]
         return np.asarray(np.abs(aside - usual) <= self.detector_shape[1] / 2)
@@ -265,7 +265,7 @@ class Geometry:
     def reach(self) -> float:
         """mm from the rotation axis to the farthest column edge of any view, measured at the axis.
 
-        Rolled views count as straight ones, wide views do not. For a wide cone the value is limited to 0.7 sod.
+        Rolled views count as straight ones, offset views do not. For a wide cone the value is limited to 0.7 sod.
         """
         cols, axis = self.detector_shape[1], (self.axis_col + self.offsets[:, 0])[self.is_centred]
         reach = max(axis.max() + 0.5, cols - 0.5 - axis.min()) * self.sample_pitch

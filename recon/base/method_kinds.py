@@ -23,7 +23,7 @@ class Direct(Method):
     makes_boxes: ClassVar[bool] = True
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
-        """All but wide views, see `Geometry.is_centred`."""
+        """All but offset views, see `Geometry.is_centred`."""
         return geometry.is_centred
 
 

@@ -55,10 +55,13 @@ class Setting:
 
     @property
     def words(self) -> str:
-        """The bounds of a number in a sentence."""
-        if self.ge is not None and self.le is not None:
-            return f"from {self.ge:g} to {self.le:g}"
-        return f"above {self.gt:g}" if self.gt is not None else f"of {self.ge:g} or more"
+        """The bounds in a sentence, such as `> 0 and <= 5`: the words of configurations, options and Python."""
+        return self._text(self.bounds)
+
+    @staticmethod
+    def _text(bounds: Mapping[str, Any]) -> str:
+        shown = {name: f"{each:g}" if isinstance(each, float) else each for name, each in bounds.items()}
+        return " and ".join(f"{_WORDS[name]} {each}" for name, each in shown.items())
 
     def fault(self, value: Any) -> str:
         """What is wrong with the value of a field; "" where nothing is."""
@@ -68,7 +71,7 @@ class Setting:
             return ""
         bounds = {name: self.inside(bound) for name, bound in self.bounds.items()}
         if not all(_WITHIN[name](value, bound) for name, bound in bounds.items()):
-            return f"expected {' and '.join(f'{_WORDS[name]} {bound}' for name, bound in bounds.items())}"
+            return f"expected {self._text(bounds)}"
         return "" if self.problem is None else self.problem(value)
 
     def key_of(self, field: str) -> str:

@@ -113,7 +113,7 @@ class FinalFit(Iterative):
     """The last round of a fit, over the views that it was already fitted to, and the sweeps after it.
 
     Attributes:
-        fit: holds the line integrals of the problem that it is run on, in the same order, but for wide views.
+        fit: holds the line integrals of the problem that it is run on, in the same order, but for offset views.
         method: that began the fit.
         seconds: for the round and the sweeps, at most.
         began: when the fit began to wait for views, by the clock of the run; `Progress.seconds` count from there.

@@ -321,7 +321,7 @@ class Fbp(Direct):
         return Reconstruction(Volume(data, problem.grid), {"filter": self.filter})
 
     def views_wanted(self, geometry: Geometry) -> NDArray[np.bool_]:
-        """All but wide views. ValueError for a cone's views that FDK does not take."""
+        """All but offset views. ValueError for a cone's views that FDK does not take."""
         if geometry.is_cone and missing_arc(geometry) > 0:
             cone_weights(geometry)  # says how many degrees they lack
         return super().views_wanted(geometry)
@@ -345,7 +345,7 @@ def direct(
     device: str = "cpu",
 ) -> F32:
     """FBP of a parallel beam, FDK of a cone [z, y, x], both along the rays of rolled and tilted views; see `fbp`, `fdk`
-    and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU. Wide views have no
+    and `posed_direct`. Only `fbp` takes `out`. Straight views of a parallel beam stay on the CPU. Offset views have no
     part."""
     if not (own := geometry.is_centred).all():
         projections, geometry = projections[own], geometry.select(np.flatnonzero(own))

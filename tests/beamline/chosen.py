@@ -67,7 +67,7 @@ class Scripted:
     def __call__(self, passes: Passes) -> Choice:
         choice = next(self.script, Choice.NEXT)
         possible = {
-            Choice.NEXT: True, Choice.AGAIN: passes.may_repeat, Choice.WIDE: bool(passes.wide),
+            Choice.NEXT: True, Choice.AGAIN: passes.may_repeat, Choice.OFFSET: bool(passes.offset),
             Choice.RETAKE: passes.retakes > 0, Choice.ENOUGH: True,
         }  # fmt: skip
         self.asked.append(passes)

@@ -55,7 +55,7 @@ SCANS: dict[str, dict[str, np.ndarray | None]] = {
 """Good, and with what is wrong in it."""
 VOLUMES = {
     "scan": np.arange(8.0).reshape(2, 2, 2), "ramp": np.arange(120.0).reshape(4, 5, 6), "even": np.ones((4, 5, 6)),
-    "holes": np.full((4, 5, 6), np.nan), "flat": np.ones((5, 6)),
+    "holes": np.full((4, 5, 6), np.nan), "flat": np.ones((5, 6)), "scalar": np.float32(3),
 }  # fmt: skip
 
 

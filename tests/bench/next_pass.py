@@ -240,7 +240,7 @@ def _with(state: State, passes: int) -> State:
 
 
 def fixed(number: int, scores: ScoreFile, frames: int) -> float:
-    """dB of the fixed plan of so many frames, between those of whole passes; wide views and retakes come last."""
+    """dB of the fixed plan of so many frames, between those of whole passes; offset views and retakes come last."""
     whole = whole_plan(number)
     if frames >= VIEWS:
         return scores.score(number, whole if frames >= whole.frames(number) else State(PASSES)).quality

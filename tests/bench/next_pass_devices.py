@@ -85,7 +85,7 @@ def config_of(number: int, **more: object) -> Config:
         "simulation.scene": scene_of(number),
     }
     if recipe.over > 1:
-        values |= {"scan.wide_views": WIDE_ANGLES, "sample.diameter_mm": recipe.over * COLS * PITCH}
+        values |= {"scan.offset_views": WIDE_ANGLES, "sample.diameter_mm": recipe.over * COLS * PITCH}
     return load(SHIPPED, [override_of(key, value) for key, value in (values | more).items()], {})
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from beamline.plan.choose import Wish, choose, options, remaining_gain
+from beamline.plan.choose import ScanTarget, choose, options, remaining_gain
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block
 from beamline.plan.timeline import block_seconds
@@ -48,7 +48,7 @@ def planned(number: int) -> DryRun:
     return dry_run(config_of(number))
 
 
-def decided(number: int, seed: int, scores: ScoreFile, wish: Wish) -> tuple[list[Step], State]:
+def decided(number: int, seed: int, scores: ScoreFile, target: ScanTarget) -> tuple[list[Step], State]:
     """The decisions of `do`, and the state that the scan ends in."""
     plan = planned(number)
     timeline = plan.timeline
@@ -57,7 +57,7 @@ def decided(number: int, seed: int, scores: ScoreFile, wish: Wish) -> tuple[list
         return block_seconds(block, plan.stage, plan.camera, plan.plan.settle)
 
     blocks = pass_blocks(timeline.views, 0)
-    wide = tuple(block for block in timeline.blocks if block.kind is FrameKind.WIDE_VIEW)
+    wide = tuple(block for block in timeline.blocks if block.kind is FrameKind.OFFSET_VIEW)
     state, done, to_come, steps = State(1), blocks[:1], blocks[1:], list[Step]()
     while True:
         passes = Passes(done, to_come, () if state.wide else wide, _retakes(number, state))
@@ -65,7 +65,7 @@ def decided(number: int, seed: int, scores: ScoreFile, wish: Wish) -> tuple[list
             return steps, state._replace(wide=bool(wide))
         law = scores.law(number, seed, state)
         offered, remaining = options(passes, law, timeline, seconds_of), remaining_gain(passes, law)
-        choice, _ = choose(offered, wish, remaining, 0.0, 0.0)
+        choice, _ = choose(offered, target, remaining, 0.0, 0.0)
         steps.append(Step(state, law, choice, remaining.mean))
         match choice:
             case Choice.NEXT:
@@ -74,7 +74,7 @@ def decided(number: int, seed: int, scores: ScoreFile, wish: Wish) -> tuple[list
             case Choice.AGAIN:
                 done, to_come = (*done, done[-1]), to_come[:-1]
                 state = state._replace(again=(*state.again, state.passes - 1))
-            case Choice.WIDE:
+            case Choice.OFFSET:
                 state = state._replace(wide=True)
             case Choice.RETAKE:
                 state = state._replace(retaken=True)
@@ -108,9 +108,9 @@ class Outcome:
     middle: float
 
 
-def outcome(number: int, seed: int, scores: ScoreFile, wish: Wish) -> Outcome:
+def outcome(number: int, seed: int, scores: ScoreFile, target: ScanTarget) -> Outcome:
     """Of one scene and noise."""
-    steps, state = decided(number, seed, scores, wish)
+    steps, state = decided(number, seed, scores, target)
     score, frames = scores.score(number, state), state.frames(number)
     right = []
     for step in steps:
@@ -130,7 +130,7 @@ def outcome(number: int, seed: int, scores: ScoreFile, wish: Wish) -> Outcome:
     )
 
 
-def table(scores: ScoreFile, numbers: Sequence[int], seeds: Sequence[int], wish: Wish) -> str:
+def table(scores: ScoreFile, numbers: Sequence[int], seeds: Sequence[int], target: ScanTarget) -> str:
     """Markdown: medians of the seeds for each scene, and in the last line what was asked of all."""
     lines = [
         "| scene | ends with | frames | over hindsight | below all, dB | over fixed, dB | predictions | middle |",
@@ -138,7 +138,7 @@ def table(scores: ScoreFile, numbers: Sequence[int], seeds: Sequence[int], wish:
     ]
     of_all = []
     for number in numbers:
-        outcomes = [outcome(number, seed, scores, wish) for seed in seeds]
+        outcomes = [outcome(number, seed, scores, target) for seed in seeds]
         of_all += outcomes
         right = [was_right for one in outcomes for was_right in one.right]
         median = {
@@ -154,8 +154,8 @@ def table(scores: ScoreFile, numbers: Sequence[int], seeds: Sequence[int], wish:
     right = [was_right for one in of_all for was_right in one.right]
     ratio = statistics.median(one.ratio for one in of_all)
     worst = min(one.over_fixed for one in of_all)
-    wished = wish.quality_db or 0.0
-    near = f"{sum(one.below <= wished for one in of_all)} of {len(of_all)} reach {wished:g}"
+    target_db = target.quality_db or 0.0
+    near = f"{sum(one.below <= target_db for one in of_all)} of {len(of_all)} reach {target_db:g}"
     lines.append(f"| all | | | {ratio:.2f} | {near} | {worst:+.2f} at least | {sum(right)} of {len(right)} | |")
     return "\n".join(lines)
 
@@ -167,7 +167,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="0,1,2")
     arguments = parser.parse_args()
     numbers, seeds = ([int(word) for word in words.split(",")] for words in (arguments.scenes, arguments.seeds))
-    print(table(ScoreFile(arguments.scores), numbers, seeds, Wish(quality_db=WISH)))
+    print(table(ScoreFile(arguments.scores), numbers, seeds, ScanTarget(quality_db=WISH)))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Lengths are in pixels of the detector, which are as wide as voxels, and densities in 1/pixel. 128 columns x 8 rows, 720
 views over half a turn in 8 interlaced passes, line integrals as means of nine rays of a pixel, the noise of so many
-photons a pixel in the open beam. A sample that is wider than the field has wide views too: at 4 angles it is stepped
+photons a pixel in the open beam. A sample that is wider than the field has offset views too: at 4 angles it is stepped
 aside by 0.9 of the field to either side. A drifting sample moves across the beam, steadily, by `DRIFT` pixels from the
 first view to the last. A crumb crosses the field in `CRUMBED` views of the third pass; they are flagged, and no volume
 uses them unless they were taken again.
@@ -102,10 +102,10 @@ class Scene:
     """A scan without noise.
 
     Attributes:
-        clean: line integrals [view, row, col] in the order of acquisition, then those of the wide views; without crumb.
+        clean: line integrals [view, row, col] in the order of acquisition, then of the offset views; without crumb.
         crumb: [view, row, col], what a crumb adds to the views of `CRUMBED`; of no view in other scenes.
         truth: [z, y, x], see the module.
-        geometry: of the views, then of the wide views.
+        geometry: of the views, then of the offset views.
     """
 
     clean: F32
@@ -115,7 +115,7 @@ class Scene:
 
 
 def geometry_of(over: float, angles: F64) -> Geometry:
-    """Views at these angles, and the wide views of a sample that is wider than the field."""
+    """Views at these angles, and the offset views of a sample that is wider than the field."""
     places = (-0.9 * COLS, 0.9 * COLS) if over > 1 else ()
     wide = np.arange(WIDE_ANGLES) * np.pi / WIDE_ANGLES
     shifts = np.zeros((angles.size + len(places) * WIDE_ANGLES, 2))

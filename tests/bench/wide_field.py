@@ -1,12 +1,12 @@
 """A sample wider than the field: dB, density, axis and CPU seconds by method, on packed balls in a can.
 
     python -m tests.bench.wide_field [--seeds 7,8] [--over 1.0,1.5,2.0,3.0] [--methods fbp,fista-tv,auto]
-        [--columns 192] [--rows 12] [--views 90] [--wide-views 4]
+        [--columns 192] [--rows 12] [--views 90] [--offset-views 4]
 
 Line integrals are exact chords, nine in a pixel, with the noise of 30 000 photons; the darkest ray keeps exp(-2). PSNR
 is within 0.95 of the field, over the largest density; the density is the mean in the middle half of the field over the
 true one. "known" is FISTA-TV where what lies outside is known and taken off the views: no method can expect more.
-With `--wide-views` the sample is stepped aside by 0.9 of the field at so many angles.
+With `--offset-views` the sample is stepped aside by 0.9 of the field at so many angles.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def scene(seed: int, over: float, cols: int, rows: int, geometry: recon.Geometry
 
 
 def geometry_of(cols: int, rows: int, views: int, wide: int, over: float) -> recon.Geometry:
-    """Half a turn, and so many wide views."""
+    """Half a turn, and so many offset views."""
     steps = [k * 0.9 * cols for k in range(-9, 10) if k and abs(k) * 0.9 - 0.5 < over / 2]
     angles = np.concatenate(
         (np.arange(views) * np.pi / views, np.repeat(np.arange(wide) * np.pi / max(wide, 1), len(steps)))
@@ -116,12 +116,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     for name, default in (("seeds", "7,8"), ("over", "1.0,1.5,2.0,3.0"), ("methods", "fbp,fista-tv,auto")):
         parser.add_argument(f"--{name}", default=default)
-    for name, number in (("columns", 192), ("rows", 12), ("views", 90), ("wide-views", 0)):
+    for name, number in (("columns", 192), ("rows", 12), ("views", 90), ("offset-views", 0)):
         parser.add_argument(f"--{name}", type=int, default=number)
     given = parser.parse_args()
     print("over  seed  method      dB  density  radius/field   CPU s")
     for over, seed in ((float(o), int(s)) for o in given.over.split(",") for s in given.seeds.split(",")):
-        geometry = geometry_of(given.columns, given.rows, given.views, given.wide_views, over)
+        geometry = geometry_of(given.columns, given.rows, given.views, given.offset_views, over)
         made = scene(seed, over, given.columns, given.rows, geometry)
         ordinary = np.flatnonzero(geometry.is_centred)
         axis = recon.find_axis(made.views[ordinary], geometry.angles[ordinary])

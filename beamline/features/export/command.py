@@ -12,6 +12,7 @@ import click
 
 from beamline.cli.options import (
     NameChoice,
+    WholeRange,
     dataset_option,
     json_option,
     parsed,
@@ -81,7 +82,7 @@ class ExportRequest:
         help="Write displacement, roll and tilt of the volume's views as a .csv that --poses reads.",
     )
     at: int | None = set_by(
-        "--at", type=click.IntRange(min=0), metavar="K", help="Volume K of a time series, counted from 0."
+        "--at", type=WholeRange(min=0), metavar="K", help="Volume K of a time series, counted from 0."
     )
     dataset: str | None = set_by(dataset_option)
     as_json: bool = set_by(json_option)

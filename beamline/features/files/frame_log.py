@@ -32,7 +32,7 @@ def framestamp_order(source: ScanSource) -> Iterator[Finding]:
         return
     steps, rows = np.diff(stamps), np.arange(key.size)
     passes = np.searchsorted(table.pass_ends, rows, "right")  # one may be repeated
-    aside = np.zeros(key.size) if table.aside is None else table.aside  # wide views count on, as retakes do
+    aside = np.zeros(key.size) if table.aside is None else table.aside  # offset views count on, as retakes do
     new = np.zeros(key.size, np.bool_)
     new[np.unique(np.stack([key, triggers, passes, aside]), axis=1, return_index=True)[1]] = True
     new[table.part_starts] = True

@@ -81,7 +81,7 @@ def ingest(
             distance_mm=distance if isinstance(distance, int | float) else None,
             source_distance_mm=None if source.cone is None else source.cone[0],
             plan=json_of({} if other_angles else dict(source.plan)),
-            wide_views=source.table.aside is not None,
+            offset_views=source.table.aside is not None,
             decides=source.table.pass_ends.size > 0,
         )
         with hdf5.created(partial, layout.LIBVER) as file:

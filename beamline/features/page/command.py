@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import say
+from beamline.cli.options import WholeRange, say
 from beamline.cli.recipe import DATA, OUTPUT, Grouped, heading
 from beamline.cli.selection_options import scan_options
 from beamline.cli.terminal import ACT, ENDS_WITHIN, LOOK, answering
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 LOOPBACK, PORT = "127.0.0.1", 8642
 
 port_option = click.option(
-    "--port", default=PORT, show_default=True, type=click.IntRange(0, 65535), help="Port, or else the next free one."
+    "--port", default=PORT, show_default=True, type=WholeRange(0, 65535), help="Port, or else the next free one."
 )
 bind_option = click.option(
     "--bind", default=LOOPBACK, show_default=True, metavar="ADDRESS", help="To listen at; 0.0.0.0: all."

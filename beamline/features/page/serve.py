@@ -14,9 +14,9 @@ import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import psutil
@@ -30,15 +30,13 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from beamline.core.errors import ConfigError, DataError
 from beamline.features.page.app import KNOWN, Access, begins_with, guarded, page_routes
+from beamline.features.page.entrance import Entrance
 from beamline.page.run_files import Reader, watched
 from beamline.scan.runs import HEAD, cells, describe, runs_in
 
 CONNECTIONS = 96
 """Beyond so many, the oldest one in which nothing is answered is closed for a new one. A browser opens six, and a
 process of macOS may open 256 files."""
-_AT_ONCE, _WAITING = 32, 256
-"""Connections that asyncio accepts before it serves them, and that wait in the system. At 1000 new ones a second, 95 of
-100 requests of the owner took up to 1.6 s where 1024 wait, 0.2 s where 256 do."""
 _KNOWN_STAYS = 3600  # s without a request
 OPEN_RUNS = 8
 """Runs whose files stay open without anybody who watches."""
@@ -155,19 +153,22 @@ class _Connection(H11Protocol):
 
 
 class _Server(uvicorn.Server):
-    """A server that says when it ends, so that feeds of open pages end by themselves."""
+    """A server behind an entrance, which says when it ends, so that feeds of open pages end by themselves."""
 
-    def __init__(self, config: uvicorn.Config, ended: Event) -> None:
+    def __init__(self, config: uvicorn.Config, access: Access) -> None:
         super().__init__(config)
-        self._ended = ended
+        self._access = access
+        self._entrances: list[Entrance] = []
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
-        for listening in sockets or ():
-            listening.listen(_WAITING)  # asyncio has set its own number
+        await super().startup([])
+        protocol = partial(_Connection, self.config, self.server_state, self.lifespan.state)
+        self._entrances = [Entrance(each, protocol, self._access.look.encode()) for each in sockets or ()]
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        self._ended.set()
+        self._access.ended.set()
+        for entrance in self._entrances:
+            entrance.close()
         await super().shutdown(sockets)
 
 
@@ -180,16 +181,17 @@ class PageServer:
         self.addresses = Addresses(root, None if access.act is None else f"{root}#act={access.act}")
         self._server = _Server(
             uvicorn.Config(
-                app, log_level="warning", access_log=False, lifespan="off", http=_Connection, backlog=_AT_ONCE,
+                app, log_level="warning", access_log=False, lifespan="off", http=_Connection,
                 timeout_graceful_shutdown=1, server_header=False, proxy_headers=False,
             ),
-            access.ended,
+            access,
         )  # fmt: skip
 
     def run(self) -> None:
         """Serve until `stop`, or Ctrl-C in the main thread."""
-        with closing(self._listening):
-            asyncio.run(self._server.serve(sockets=[self._listening]))
+        selecting = asyncio.SelectorEventLoop  # that of Windows cannot wait until a connection has sent something
+        with closing(self._listening), asyncio.Runner(loop_factory=selecting) as runner:
+            runner.run(self._server.serve(sockets=[self._listening]))
 
     def stop(self) -> None:
         """End `run`, from any thread."""

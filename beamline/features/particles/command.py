@@ -11,7 +11,9 @@ from beamline.cli.options import (
     NOT_NEGATIVE,
     POSITIVE,
     SEED,
+    FiniteRange,
     NameChoice,
+    WholeRange,
     json_option,
     volume_argument,
 )
@@ -23,7 +25,7 @@ from recon.base.choices import NECK
 if TYPE_CHECKING:
     from beamline.features.particles.run import Segmented, SegmentOptions
 
-_PERCENT = click.FloatRange(min=0, max=100)
+_PERCENT = FiniteRange(min=0, max=100)
 
 
 @click.command(cls=Repeatable)
@@ -38,7 +40,7 @@ _PERCENT = click.FloatRange(min=0, max=100)
     help="square: the one inside the circle of the sample, without its wall; none: the whole volume. Default: square, "
     "unless it cuts half of the bodies or more.",
 )
-@click.option("--margin", type=click.FloatRange(min=0, max=0.5, max_open=True), default=0.05, show_default=True,
+@click.option("--margin", type=FiniteRange(min=0, max=0.5, max_open=True), default=0.05, show_default=True,
               help="Share of the square's side taken off at each end.")  # fmt: skip
 @click.option("--percentiles", type=_PERCENT, nargs=2, default=(0.5, 99.5), show_default=True, metavar="LOW HIGH",
               help="Percentiles at which grey values are clipped.")  # fmt: skip
@@ -47,11 +49,11 @@ _PERCENT = click.FloatRange(min=0, max=100)
     "--sigma", type=NOT_NEGATIVE, default=0.7, show_default=True, help="Width of the Gaussian filter, voxels."
 )
 @click.option(
-    "--clusters", type=click.IntRange(2, 12), help="Classes of grey values (k-means). Default: by the elbow rule."
+    "--clusters", type=WholeRange(2, 12), help="Classes of grey values (k-means). Default: by the elbow rule."
 )
-@click.option("--radius", type=click.IntRange(0, 20), default=1, show_default=True,
+@click.option("--radius", type=WholeRange(0, 20), default=1, show_default=True,
               help="Radius of opening and closing, voxels; 0: neither.")  # fmt: skip
-@click.option("--smallest", type=click.IntRange(min=0), default=27, show_default=True,
+@click.option("--smallest", type=WholeRange(min=0), default=27, show_default=True,
               help="Voxels of the smallest particle that is kept.")  # fmt: skip
 @click.option("--neck", type=NOT_NEGATIVE, default=NECK, show_default=True,
               help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: "

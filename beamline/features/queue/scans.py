@@ -25,7 +25,7 @@ from beamline.core.stop import StopRequest
 from beamline.core.text import aligned, count, size
 from beamline.instrument.connect import ask_operator
 from beamline.plan.limits import ROOM
-from beamline.plan.timeline import duration_text
+from beamline.plan.timeline import hms_text
 from beamline.scan.moves import UNSAFE
 from beamline.scan.preflight import DryRun, dry_run
 from drivers.base.clock import SystemClock
@@ -162,10 +162,10 @@ class QueueNeeds:
         """A line for each scan, and the sum."""
         rows = [
             (name, str((len(worked.energies) or 1) * worked.timeline.n_frames), size(worked.total_bytes),
-             duration_text(_seconds(worked)))
+             hms_text(_seconds(worked)))
             for name, worked in self.scans
         ]  # fmt: skip
-        total = f"{size(self.total_bytes)} of {size(self.free_bytes)} free, {duration_text(self.duration)}"
+        total = f"{size(self.total_bytes)} of {size(self.free_bytes)} free, {hms_text(self.duration)}"
         return [
             aligned([("scan", "frames", "size", "time"), *rows]),
             "",

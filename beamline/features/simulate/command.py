@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from beamline.cli.options import json_events, with_request
+from beamline.cli.options import WholeRange, json_events, with_request
 from beamline.cli.terminal import Terminal
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Done, Sink, StepsListed
@@ -49,8 +49,8 @@ def effects_text() -> str:
 
 
 _OVERRIDE_HELP = "Override a value of the scene, such as detector.shape=[2048,2048]. May be repeated."
-_VIEWS = click.IntRange(1)
-_SEED = click.IntRange(0, 2**63 - 1)
+_VIEWS = WholeRange(1)
+_SEED = WholeRange(0, 2**63 - 1)
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
 
@@ -92,7 +92,7 @@ class SimulateRequest:
     )
     truth_bin: int | None = set_by(
         "--truth-bin",
-        type=click.IntRange(min=1),
+        type=WholeRange(min=1),
         help="Side of a voxel of the truth in pixels: the --bin of the reconstruction to compare. Default: for 256 "
         "voxels.",
     )

@@ -14,6 +14,7 @@ from beamline.cli.method_options import equal_time, row_options, row_settings
 from beamline.cli.options import (
     MethodChoice,
     NameChoice,
+    WholeRange,
     json_option,
     new_folder_option,
     others,
@@ -161,7 +162,7 @@ class StudyRequest:
     )
     draws: int = set_by(
         "--draws",
-        type=click.IntRange(min=1, max=100),
+        type=WholeRange(min=1, max=100),
         default=3,
         show_default=True,
         help="How often the study random draws its views.",

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _OF_A_VOLUME = frozenset(
     ("output", "report", "write-config", "json", "dry-run", "max-residual", "truth", "uncertainty",
-     "roi", "follow", "earlier", "memory", "cluster", "checkpoint", "resume", "budget",
-     "time", "moves", "beside-scan")
+     "roi", "follow", "previous-part", "memory", "cluster", "checkpoint", "resume", "budget",
+     "volumes", "moves", "beside-scan")
 )  # fmt: skip
 """Options of `beamline recon` that a slice has no use for."""
 

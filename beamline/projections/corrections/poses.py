@@ -166,7 +166,7 @@ def poses_of(source: ScanSource, selection: ScanSelection, frames: I64) -> ScanP
     shifts = table.shifts * _pixels(table, source, selection)
     rows = _rows(table, source, frames)
     height, width = source.shape
-    if (far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():  # wide views are a few fields aside
+    if (far := (np.abs(shifts) >= (8 * width, height)).any(axis=1)).any():  # offset views are a few fields aside
         row = int(np.flatnonzero(far)[0])
         raise DataError(
             f"{table.path}: {table.by} {table.keys[row]:g} is displaced by {shifts[row, 0]:g} columns and "

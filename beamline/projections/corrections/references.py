@@ -75,7 +75,7 @@ class _Reading:
         return np.asarray(total / n) if n else None
 
     def darks(self, frames: NDArray[np.int64]) -> list[tuple[float, NDArray[np.float64]]]:
-        """The mean dark of each exposure; of all, with NaN for their exposure, where they have one or it is unknown."""
+        """(exposure in s, mean dark) of each exposure; (NaN, mean of all) where exposures are equal or unknown."""
         means = [(seconds, self.mean(some)) for seconds, some in self.scan.by_exposure(frames)]
         return [(seconds, mean) for seconds, mean in means if mean is not None]
 

@@ -52,7 +52,9 @@ def _distortion(text: str) -> resample.Distortion:
 
     try:
         return Distortion.parse(text_in(Path(text)))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ValueError(f"{text}: {error.strerror or error}") from error
+    except ValueError as error:
         raise ValueError(f"{text}: {error}") from error
 
 

@@ -134,7 +134,7 @@ class NexusSource(ScanSource):
             raise DataError(
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
-        self.n, written = n, [kind for kind in FrameKind if kind is not FrameKind.WIDE_VIEW]
+        self.n, written = n, [kind for kind in FrameKind if kind is not FrameKind.OFFSET_VIEW]
         seconds, times = self._seconds(places.detector, "count_time"), self._seconds(places.entry, "frame_log/time")
         exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
         logged = {f"{name}s": self._column(f"frame_log/{name}") for name in ("trigger", "framestamp")}

@@ -97,7 +97,13 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
     if name.isdecimal() and shape is not None and not path.exists():
         return np.full((1, *shape), int(name), np.min_scalar_type(int(name)))
     if holds_arrays(path):
-        with closing(open_array_file(path)) as arrays, hdf5.readable(path):
+        try:
+            opened = open_array_file(path)
+        except UNREADABLE as error:
+            raise DataError(
+                f"The reference frames in {path} cannot be read as arrays ({hdf5.reason(error)})."
+            ) from error
+        with closing(opened) as arrays, hdf5.readable(path):
             return _in_rows(_read(path, dataset_at(arrays, dataset)), shape)
     if path.is_file() and hdf5.is_hdf5(path):
         with hdf5.open_hdf5(path) as file, hdf5.readable(path):

@@ -61,7 +61,7 @@ IMAGE_KEY_CONTROL = f"{DETECTOR}/image_key_control"
 FIELD_OF_VIEW = f"{DETECTOR}/field_of_view"
 ANGLE = "/entry/sample/rotation_angle"
 KIND = "/entry/frame_log/kind"
-X_TRANSLATION = "/entry/sample/x_translation"  # `Frame.aside`; only of scans with wide views
+X_TRANSLATION = "/entry/sample/x_translation"  # `Frame.aside`; only of scans with offset views
 PREVIEW = "/entry/digest/preview"
 COUNT_TIME = f"{DETECTOR}/count_time"
 TRIGGER = "/entry/frame_log/trigger"
@@ -147,7 +147,7 @@ class ScanInfo:
         monochromator_kev: at which it stands; `energy_kev` is the same then. None: there is none, or it is not known.
         beam_unit: of the beam monitor's readings; None: there is none.
         saturation: the count from which a pixel is saturated.
-        wide_views: whether some are planned.
+        offset_views: whether some are planned.
         decides: whether what is measured next is chosen after each pass.
         diameter_mm: of the sample.
     """
@@ -168,7 +168,7 @@ class ScanInfo:
     filter: str | None = None
     monochromator_kev: float | None = None
     saturation: float | None = None
-    wide_views: bool = False
+    offset_views: bool = False
     decides: bool = False
     diameter_mm: float | None = None
 
@@ -287,7 +287,7 @@ def _columns(
     _growing(file, DATA, frame_shape, dtype)
     _growing(file, PREVIEW, preview_shape(frame_shape, preview_bin), np.dtype("<f4"))
     file[PREVIEW].attrs["bin"] = np.int64(preview_bin)
-    wide = {X_TRANSLATION: ("<f8", "mm")} if info.wide_views else {}
+    wide = {X_TRANSLATION: ("<f8", "mm")} if info.offset_views else {}
     for path, (kind, unit) in {**COLUMNS, **wide}.items():
         _growing(file, path, (), np.dtype(kind))
         if unit:

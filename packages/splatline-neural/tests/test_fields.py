@@ -93,7 +93,7 @@ def test_what_a_field_cannot_do_is_refused() -> None:
         recon.reconstruct(np.zeros_like(data), VIEWS["parallel"], NAF())
     with pytest.raises(ValueError, match=r"'naf' has no option resume"):
         recon.reconstruct(data, VIEWS["parallel"], NAF(), control=RunControl(resume={}))
-    with pytest.raises(ValueError, match="steps must be a whole number of 1 or more"):
+    with pytest.raises(ValueError, match="steps must be a whole number >= 1"):
         IntraTomo(steps=0)
 
 

@@ -168,7 +168,7 @@ class Ghost(ImageEffect, Anomaly):
 
     def __post_init__(self) -> None:
         if self.gain == 0:
-            raise ValueError("gain must be other than 0, which shows nothing")
+            raise ValueError("gain is 0, which shows no ghost; expected any other number")
 
     def apply(self, image: Image, shot: Shot) -> Image:
         first, change = self._change(shot)

@@ -109,7 +109,7 @@ SCAN = {
 OPTIONS = [
     option("next", 0.82, (0.61, 1.02), 90, 95.2, 0.125, 1.21e9),
     option("again", -0.31, (-0.52, 0.1), 90, 95.2, 0.125, 1.21e9),
-    option("wide", None, UNKNOWN, 48, 12345.0, 0.067, 6.4e11), option("enough"),
+    option("offset", None, UNKNOWN, 48, 12345.0, 0.067, 6.4e11), option("enough"),
 ]  # fmt: skip
 CHOSEN = {"number": 3, "n_views": 270, "choice": "again", "reason": "it brings most a second.", "options": OPTIONS}
 EVENTS = [
@@ -188,7 +188,7 @@ Pass 3 is over, 270 views so far. What can be measured next:
   choice gain, dB                dB/min        s     dose      data
 > next   +0.82 (0.61 to 1.02)     +0.52       95   12.5 %   1.21 GB
   again  -0.31 (-0.52 to 0.10)    -0.20       95   12.5 %   1.21 GB
-  wide   not known                    -    12345    6.7 %    640 GB
+  offset not known                    -    12345    6.7 %    640 GB
   enough +0.00                        -        0    0.0 %       0 B
 """
 PASS = {"number": 3, "n_views": 270, "options": OPTIONS, "recommended": "next"}

@@ -11,7 +11,7 @@ from tests.beamline.config_file import GOOD, faults, load
 FAULTS = {
     "former key": (
         ("sample: {name: test}", "sample: {name: test}\nrecon: {stop_when: null}"),
-        "my.yaml:2: recon.stop_when is no longer a key; leave it out. scan.decide: do with scan.wish: {quality_db",
+        "my.yaml:2: recon.stop_when is no longer a key; leave it out. scan.decide: do with scan.target: {quality_db",
     ),
     "decision": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: perhaps"),
@@ -19,8 +19,8 @@ FAULTS = {
     ),
     "on is no decision": (("exposure_s: 0.01", "exposure_s: 0.01\n  decide: on"), "decide is true (YAML reads yes"),
     "dose": (
-        ("exposure_s: 0.01", "exposure_s: 0.01\n  wish: {dose: 50}"),
-        "my.yaml:5: scan.wish.dose is 50; expected a number > 0 and <= 1 | null",
+        ("exposure_s: 0.01", "exposure_s: 0.01\n  target: {dose: 50}"),
+        "my.yaml:5: scan.target.dose is 50; expected a number > 0 and <= 1 | null",
     ),
     "decision without passes": (
         ("exposure_s: 0.01", "exposure_s: 0.01\n  decide: do\n  mode: step"),

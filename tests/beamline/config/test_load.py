@@ -10,8 +10,9 @@ from pydantic import ValidationError
 
 from beamline.config import load as config
 from beamline.core.errors import ConfigError
+from beamline.plan.passes import Choice
 from beamline.plan.plan import Mode, Place
-from tests.beamline.config_file import CONFIGS, GOOD, load, write
+from tests.beamline.config_file import CONFIGS, GOOD, faults, load, write
 
 
 @pytest.mark.parametrize("name", CONFIGS)
@@ -39,11 +40,21 @@ def test_a_decision_is_off_unless_asked_for_and_off_needs_no_quotes(tmp_path: Pa
     assert load(path).scan.decide == load(write(tmp_path)).scan.decide == "off"
     assert load(path, "scan.decide=off", BEAMLINE_SCAN__DECIDE="off").scan.decide == "off"
     decides = load(path, "scan.decide=do", PASSES)
-    wish = decides.scan.wish
-    assert (wish.quality_db, wish.seconds, wish.dose, decides.scan.wait_s) == (1.0, None, None, 30.0)
-    wish = load(path, "scan.decide=do", PASSES, "scan.wish={seconds: 600, dose: 0.5}").scan.wish
-    assert (wish.quality_db, wish.seconds, wish.dose) == (None, 600.0, 0.5)
+    target = decides.scan.target
+    assert (target.quality_db, target.seconds, target.dose, decides.scan.wait_s) == (1.0, None, None, 30.0)
+    target = load(path, "scan.decide=do", PASSES, "scan.target={seconds: 600, dose: 0.5}").scan.target
+    assert (target.quality_db, target.seconds, target.dose) == (None, 600.0, 0.5)
     assert config.changed(decides, config.NO_LIVE).scan.decide == "off"  # read back from text
+
+
+def test_names_of_keys_in_the_last_version_are_understood_with_their_places(tmp_path: Path) -> None:
+    old = GOOD.replace("scan:\n", "scan:\n  wish: {seconds: 600}\n  without_watchdog: pause\n")
+    scan = load(write(tmp_path, old), "scan.wish.dose=0.5", BEAMLINE_SCAN__WITHOUT_WATCHDOG="warn").scan
+    assert (scan.target.seconds, scan.target.dose, scan.on_watchdog_loss) == (600.0, 0.5, "warn")
+    assert "my.yaml:3: scan.target.seconds is -1; expected" in faults(tmp_path, old.replace("600", "-1"))
+    both = faults(tmp_path, old.replace("  wish", "  target: {dose: 1}\n  wish"))
+    assert "my.yaml:4: scan.wish is not a known key" in both
+    assert Choice("wide") is Choice.OFFSET
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What is measured next: the best gain a second until the wish is met, and never beyond a wish."""
+"""What is measured next: the best gain a second until the target is met, and never beyond a target."""
 
 import math
 from dataclasses import replace
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from beamline.plan.choose import PassOption, Wish, choose, frame_dose, next_is_sure, options, remaining_gain
+from beamline.plan.choose import PassOption, ScanTarget, choose, frame_dose, next_is_sure, options, remaining_gain
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.plan import Block, Mode, Timeline
 from beamline.plan.timeline import block_seconds
@@ -15,14 +15,16 @@ from recon.base.error_law import ErrorLaw, Gain
 from tests.beamline.fakes import FakeInstrument
 
 NOTHING = 0.0, 0.0
-QUALITY = Wish(quality_db=1.0)
+QUALITY = ScanTarget(quality_db=1.0)
 LAW = ErrorLaw(12, 1.0, 0.1, 0.3, 0.2)
 
 
 def scan(views: int = 48, passes: int = 4, wide: int = 0) -> Timeline:
     instrument = FakeInstrument()
     plan = instrument.plan(views, passes=passes)
-    return instrument.worked_out(replace(plan, retake_share=0.25, wide_views=wide, wide_places=(-1.0, 1.0)[: 2 * wide]))
+    return instrument.worked_out(
+        replace(plan, retake_share=0.25, offset_views=wide, offset_places=(-1.0, 1.0)[: 2 * wide])
+    )
 
 
 def seconds_of(block: Block) -> float:
@@ -38,16 +40,17 @@ def after(timeline: Timeline, n: int, retakes: int = 0) -> Passes:
 def test_options_are_what_is_possible_with_what_each_takes() -> None:
     timeline = scan(wide=5)
     offered = {option.choice: option for option in options(after(timeline, 1, retakes=3), LAW, timeline, seconds_of)}
-    assert list(offered) == [Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.RETAKE, Choice.ENOUGH]
+    assert list(offered) == [Choice.NEXT, Choice.AGAIN, Choice.OFFSET, Choice.RETAKE, Choice.ENOUGH]
     assert [option.frames for option in offered.values()] == [12, 12, 10, 3, 0]
-    assert offered[Choice.NEXT].dose == pytest.approx(12 / 58) and offered[Choice.WIDE].dose == pytest.approx(10 / 58)
+    assert offered[Choice.NEXT].dose == pytest.approx(12 / 58) and offered[Choice.OFFSET].dose == pytest.approx(10 / 58)
     assert offered[Choice.NEXT].bytes == pytest.approx(12 * timeline.total_bytes / timeline.n_frames, abs=1)
     assert offered[Choice.NEXT].seconds == seconds_of(pass_blocks(timeline.views, 0)[1])
     assert offered[Choice.RETAKE].seconds == pytest.approx(3 / 12 * timeline.retake_seconds)
     gains = {choice: (option.gain, option.low, option.high) for choice, option in offered.items()}
     assert gains == {
         Choice.NEXT: tuple(vars(LAW.gain(views=12)).values()), Choice.AGAIN: tuple(vars(LAW.gain(again=12)).values()),
-        Choice.WIDE: tuple(vars(LAW.gain(wide=True)).values()), Choice.RETAKE: tuple(vars(LAW.gain(views=3)).values()),
+        Choice.OFFSET: tuple(vars(LAW.gain(wide=True)).values()),
+        Choice.RETAKE: tuple(vars(LAW.gain(views=3)).values()),
         Choice.ENOUGH: (0, 0, 0),
     }  # fmt: skip
 
@@ -74,34 +77,48 @@ NEXT, ENOUGH = option(Choice.NEXT, 1.0, off=0.2), PassOption(Choice.ENOUGH, 0, 0
 
 
 @pytest.mark.parametrize(
-    ("offered", "wish", "spent", "rest", "chosen", "why"),
+    ("offered", "target", "spent", "rest", "chosen", "why"),
     [
         ([NEXT], QUALITY, NOTHING, 1.01, Choice.NEXT, "1.00 dB (0.80 to 1.20) in 10 s"),
         ([NEXT], QUALITY, NOTHING, 1.0, Choice.ENOUGH, "would add 1.00 dB"),
-        ([NEXT], Wish(), NOTHING, 0.1, Choice.NEXT, "1.00 dB"),
-        ([NEXT], Wish(seconds=100), (90.0, 0), 9, Choice.NEXT, "1.00 dB"),
-        ([NEXT], Wish(seconds=100), (91.0, 0), 9, Choice.ENOUGH, "after 101 s; the wish allows 100 s"),
-        ([NEXT], Wish(dose=0.5), (0, 0.4), 9, Choice.NEXT, "1.00 dB"),
-        ([NEXT], Wish(dose=0.5), (0, 0.41), 9, Choice.ENOUGH, "51 % of the plan's dose; the wish allows 50 %"),
-        ([NEXT], Wish(5.0, 100, 1), NOTHING, 2, Choice.ENOUGH, "less is accepted"),  # whichever is met first
+        ([NEXT], ScanTarget(), NOTHING, 0.1, Choice.NEXT, "1.00 dB"),
+        ([NEXT], ScanTarget(seconds=100), (90.0, 0), 9, Choice.NEXT, "1.00 dB"),
+        ([NEXT], ScanTarget(seconds=100), (91.0, 0), 9, Choice.ENOUGH, "after 101 s; the target allows 100 s"),
+        ([NEXT], ScanTarget(dose=0.5), (0, 0.4), 9, Choice.NEXT, "1.00 dB"),
+        ([NEXT], ScanTarget(dose=0.5), (0, 0.41), 9, Choice.ENOUGH, "51 % of the plan's dose; the target allows 50 %"),
+        ([NEXT], ScanTarget(5.0, 100, 1), NOTHING, 2, Choice.ENOUGH, "less is accepted"),  # whichever is met first
         ([NEXT, option(Choice.AGAIN, 1.1)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice is clearly better"),
         ([NEXT, option(Choice.AGAIN, 1.2)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice"),
         ([NEXT, option(Choice.AGAIN, 1.3)], QUALITY, NOTHING, 9, Choice.AGAIN, "1.30 dB"),
         ([NEXT, option(Choice.AGAIN, 1.3, off=0.2)], QUALITY, NOTHING, 9, Choice.NEXT, "no other choice"),
-        ([NEXT, option(Choice.WIDE, 1.0, 5.0)], QUALITY, NOTHING, 9, Choice.WIDE, "1.00 dB (1.00 to 1.00) in 5 s"),
+        ([NEXT, option(Choice.OFFSET, 1.0, 5.0)], QUALITY, NOTHING, 9, Choice.OFFSET, "1.00 dB (1.00 to 1.00) in 5 s"),
         ([NEXT, option(Choice.RETAKE, 0.1, 0.5)], QUALITY, NOTHING, 9, Choice.RETAKE, "0.10 dB"),
         # The next pass takes too long, a few retakes do not.
-        ([NEXT, option(Choice.RETAKE, 0.01, 1)], Wish(seconds=5), NOTHING, 9, Choice.RETAKE, "0.01 dB"),
-        ([option(Choice.WIDE, 0.0)], Wish(seconds=99), NOTHING, 0, Choice.ENOUGH, "nothing that is left"),
-        ([option(Choice.NEXT, 0.0), option(Choice.WIDE, 1.0)], Wish(dose=1), NOTHING, 9, Choice.WIDE, "1.00 dB"),
-        ([option(Choice.WIDE, 1.0, 5.0)], Wish(seconds=99), (98.0, 0), 9, Choice.WIDE, "1.00 dB"),  # they come anyway
-        ([], Wish(dose=1), NOTHING, 0, Choice.ENOUGH, "nothing that is left"),
+        ([NEXT, option(Choice.RETAKE, 0.01, 1)], ScanTarget(seconds=5), NOTHING, 9, Choice.RETAKE, "0.01 dB"),
+        ([option(Choice.OFFSET, 0.0)], ScanTarget(seconds=99), NOTHING, 0, Choice.ENOUGH, "nothing that is left"),
+        (
+            [option(Choice.NEXT, 0.0), option(Choice.OFFSET, 1.0)],
+            ScanTarget(dose=1),
+            NOTHING,
+            9,
+            Choice.OFFSET,
+            "1.00 dB",
+        ),
+        (
+            [option(Choice.OFFSET, 1.0, 5.0)],
+            ScanTarget(seconds=99),
+            (98.0, 0),
+            9,
+            Choice.OFFSET,
+            "1.00 dB",
+        ),  # they come anyway
+        ([], ScanTarget(dose=1), NOTHING, 0, Choice.ENOUGH, "nothing that is left"),
     ],
 )
 def test_the_choice_and_its_reason(
-    offered: list[PassOption], wish: Wish, spent: tuple[float, float], rest: float, chosen: Choice, why: str
+    offered: list[PassOption], target: ScanTarget, spent: tuple[float, float], rest: float, chosen: Choice, why: str
 ) -> None:
-    choice, reason = choose([*offered, ENOUGH], wish, Gain(rest, rest / 2, 1.5 * rest), *spent)
+    choice, reason = choose([*offered, ENOUGH], target, Gain(rest, rest / 2, 1.5 * rest), *spent)
     assert choice is chosen and why in reason
 
 
@@ -109,8 +126,8 @@ def test_the_choice_and_its_reason(
 def test_where_no_law_is_known_to_half_of_it_the_scan_ends_only_if_even_its_high_end_is_accepted(
     high: float, chosen: Choice
 ) -> None:
-    assert choose([NEXT, ENOUGH], Wish(1.0), Gain(0.9, 0.05, high), 0.0, 0.0)[0] is chosen
-    assert choose([NEXT, ENOUGH], Wish(1.4), Gain(0.9, 0.05, high), 0.0, 0.0)[0] is Choice.ENOUGH
+    assert choose([NEXT, ENOUGH], ScanTarget(1.0), Gain(0.9, 0.05, high), 0.0, 0.0)[0] is chosen
+    assert choose([NEXT, ENOUGH], ScanTarget(1.4), Gain(0.9, 0.05, high), 0.0, 0.0)[0] is Choice.ENOUGH
 
 
 def test_the_rest_is_all_that_the_plan_still_has() -> None:
@@ -122,81 +139,81 @@ def test_the_rest_is_all_that_the_plan_still_has() -> None:
 
 
 @pytest.mark.parametrize(
-    ("done", "wish", "error", "sure"),
+    ("done", "target", "error", "sure"),
     [
-        (1, Wish(1.0), 0.1, True),  # after the next one the rest of 24 still adds 2.4 dB at least
-        (1, Wish(2.5), 0.1, False),
-        (1, Wish(1.0), 0.4, True),  # 1.5 dB at least: no law is taken to err by more below
-        (1, Wish(1.6), 0.4, False),
-        (2, Wish(1.0), 0.1, False),
-        (1, Wish(4.0), 0.0, False),  # it is chosen, but then met
-        (1, Wish(7.0), 0.0, False),  # met already
-        (1, Wish(seconds=99), 0.1, True),
-        (1, Wish(seconds=9), 0.1, False),
+        (1, ScanTarget(1.0), 0.1, True),  # after the next one the rest of 24 still adds 2.4 dB at least
+        (1, ScanTarget(2.5), 0.1, False),
+        (1, ScanTarget(1.0), 0.4, True),  # 1.5 dB at least: no law is taken to err by more below
+        (1, ScanTarget(1.6), 0.4, False),
+        (2, ScanTarget(1.0), 0.1, False),
+        (1, ScanTarget(4.0), 0.0, False),  # it is chosen, but then met
+        (1, ScanTarget(7.0), 0.0, False),  # met already
+        (1, ScanTarget(seconds=99), 0.1, True),
+        (1, ScanTarget(seconds=9), 0.1, False),
     ],
 )
-def test_a_next_pass_is_sure_only_if_the_wish_is_not_met_after_it_even_at_the_low_end(
-    done: int, wish: Wish, error: float, sure: bool
+def test_a_next_pass_is_sure_only_if_the_target_is_not_met_after_it_even_at_the_low_end(
+    done: int, target: ScanTarget, error: float, sure: bool
 ) -> None:
     timeline = scan()
     law, passes = ErrorLaw(12 * done, 1.0, error, 0.0), after(timeline, done)
     offered = options(passes, law, timeline, seconds_of)
-    assert next_is_sure(passes, offered, wish, law, 4.0, 0.0) is sure
+    assert next_is_sure(passes, offered, target, law, 4.0, 0.0) is sure
 
 
 LAWS = st.builds(
     ErrorLaw, st.just(12), st.floats(0, 2), st.floats(0, 0.3), st.floats(0, 0.6), st.floats(0, 0.4)
 )  # fmt: skip
 WISHES = st.builds(
-    Wish, st.none() | st.floats(0.01, 10), st.none() | st.floats(1, 100), st.none() | st.floats(0.05, 1)
+    ScanTarget, st.none() | st.floats(0.01, 10), st.none() | st.floats(1, 100), st.none() | st.floats(0.05, 1)
 )  # fmt: skip
 TIMELINE = scan(wide=5)
 FIRST = after(TIMELINE, 1)
-FIRST_SECONDS = sum(seconds_of(block) for block in (*FIRST.done, *FIRST.wide))  # wide views come in any case
+FIRST_SECONDS = sum(seconds_of(block) for block in (*FIRST.done, *FIRST.offset))  # offset views come in any case
 FIRST_DOSE = (12 + 10) * frame_dose(TIMELINE)
 
 
-def taken(law: ErrorLaw, wish: Wish) -> tuple[list[Choice], int, float, float]:
-    """What is chosen to the end, by a law that stays: the choices, views and what was spent, wide views included."""
+def taken(law: ErrorLaw, target: ScanTarget) -> tuple[list[Choice], int, float, float]:
+    """What is chosen to the end, by a law that stays: the choices, views and what was spent, offset views included."""
     passes, choices = after(TIMELINE, 1, retakes=3), list[Choice]()
     seconds, dose = FIRST_SECONDS, FIRST_DOSE
-    while passes.to_come or passes.wide or passes.retakes:
+    while passes.to_come or passes.offset or passes.retakes:
         so_far = replace(law, n_views=passes.n_frames)
         offered = options(passes, so_far, TIMELINE, seconds_of)
-        choice, _ = choose(offered, wish, remaining_gain(passes, so_far), seconds, dose)
+        choice, _ = choose(offered, target, remaining_gain(passes, so_far), seconds, dose)
         choices.append(choice)
         if choice is Choice.ENOUGH:
             break
         option = next(option for option in offered if option.choice is choice)
         assert option.gain > 0  # nothing that brings nothing is taken before ENOUGH
-        if choice is not Choice.WIDE:
+        if choice is not Choice.OFFSET:
             seconds, dose = seconds + option.seconds, dose + option.dose
         passes = replace(passes, retakes=0) if choice is Choice.RETAKE else passes.after(choice)
     return choices, passes.n_frames, seconds, dose
 
 
 @given(LAWS, WISHES)
-def test_a_scan_that_does_stays_within_its_wishes_and_the_plan(law: ErrorLaw, wish: Wish) -> None:
-    choices, views, seconds, dose = taken(law, wish)
-    assert views <= 48 and choices.count(Choice.WIDE) <= 1
-    assert seconds <= max(FIRST_SECONDS, wish.seconds or math.inf) * (1 + 1e-9)
-    assert dose <= max(FIRST_DOSE, wish.dose or math.inf) * (1 + 1e-6)
+def test_a_scan_that_does_stays_within_its_wishes_and_the_plan(law: ErrorLaw, target: ScanTarget) -> None:
+    choices, views, seconds, dose = taken(law, target)
+    assert views <= 48 and choices.count(Choice.OFFSET) <= 1
+    assert seconds <= max(FIRST_SECONDS, target.seconds or math.inf) * (1 + 1e-9)
+    assert dose <= max(FIRST_DOSE, target.dose or math.inf) * (1 + 1e-6)
 
 
 @given(LAWS, st.floats(0.01, 10), st.floats(1, 3))
-def test_with_less_quality_to_reach_no_more_views_are_taken(law: ErrorLaw, wished: float, more: float) -> None:
-    assert taken(law, Wish(quality_db=more * wished))[1] <= taken(law, Wish(quality_db=wished))[1]
+def test_with_less_quality_to_reach_no_more_views_are_taken(law: ErrorLaw, target_db: float, more: float) -> None:
+    assert taken(law, ScanTarget(quality_db=more * target_db))[1] <= taken(law, ScanTarget(quality_db=target_db))[1]
 
 
 @given(LAWS, st.floats(0.05, 1), st.floats(1, 3))
 def test_with_more_dose_to_spend_no_less_is_reached(law: ErrorLaw, dose: float, more: float) -> None:
     assume(law.exponent > 0.05)
-    few, many = (taken(law, Wish(dose=share))[3] for share in (dose, min(1.0, more * dose)))
+    few, many = (taken(law, ScanTarget(dose=share))[3] for share in (dose, min(1.0, more * dose)))
     assert few <= many * (1 + 1e-6)
 
 
 @given(LAWS)
 def test_noise_alone_is_worth_the_same_angles_only_where_it_is_better_than_new_ones(law: ErrorLaw) -> None:
     """New angles lower the noise, too: with an exponent of 1 or more they are never worse."""
-    choices, *_ = taken(replace(law, exponent=max(1.0, law.exponent)), Wish())
+    choices, *_ = taken(replace(law, exponent=max(1.0, law.exponent)), ScanTarget())
     assert Choice.AGAIN not in choices

@@ -185,7 +185,7 @@ def test_views_of_several_exposures_have_the_light_of_one(flat: float) -> None:
 
 
 def test_spots_are_sought_beside_views_with_the_sample_at_the_same_place(rng: np.random.Generator) -> None:
-    """By their angles wide views are between others, which show the sample elsewhere."""
+    """By their angles offset views are between others, which show the sample elsewhere."""
     views, angles = SCAN.counts()[2:], SCAN.angles
     wide = np.full_like(views[::3], DARK + BEAM)
     views[rng.random(views.shape) < 1e-3] += np.uint16(BEAM // 10)

@@ -56,7 +56,7 @@ def test_that_fbp_continues_the_views_is_said_where_it_does() -> None:
     for edges, continues in ((low, False), (high, True)):
         sentences = [cut_sentence(edges.beyond(), edges.continued, wide) for wide in (False, True)]
         assert [edges.continued == continues == ("FBP continues" in sentence) for sentence in sentences] == [True, True]
-        assert ["scan.wide_views" in sentence for sentence in sentences] == [True, False]
+        assert ["scan.offset_views" in sentence for sentence in sentences] == [True, False]
     _, (line,) = prepare(scan(90.0), SELECTION)
     assert "FBP continues the views, with" in line and "The edge columns are not used as air" in line
 

@@ -218,27 +218,27 @@ def test_a_mistake_is_not_taken_for_a_scan_without_a_law(laws: Laws, follow: Cal
 def test_views_that_the_fit_leaves_out_have_no_part_and_repeated_angles_stay(
     laws: Laws, follow: Callable[..., Followed]
 ) -> None:
-    """Here rows 6 and 13, which have an alarm, and wide views. The second pass has the angles of the first."""
+    """Here rows 6 and 13, which have an alarm, and offset views. The second pass has the angles of the first."""
     views = FRAMES[4:14]
-    wide = [replace(frame, kind=FrameKind.WIDE_VIEW, aside=18.0) for frame in views[:3]]
+    wide = [replace(frame, kind=FrameKind.OFFSET_VIEW, aside=18.0) for frame in views[:3]]
     order = [*FRAMES[:14], *wide, *views]
     laws.offset = 0.2
     frames = [replace(frame, index=i) for i, frame in enumerate(order)]
-    scan = follow(frames, (14, 27), flags=alarms(6, 13), wide_views=True)
+    scan = follow(frames, (14, 27), flags=alarms(6, 13), offset_views=True)
     for n in (14, 13):
         scan.seconds(n)
     assert laws.sizes == [[8], [8, 18]]
     angles = np.delete(INTERLACED.angles[:10], (2, 9))
     np.testing.assert_allclose(laws.asked[1][1].angles, [*angles, *INTERLACED.angles[:10]], atol=1e-6)
     shares = [(law["noise"], law["offset"]) for law in scan.of("error_law")]
-    assert shares == [(0.25, 0.2), (0.25 / 0.8, 0.0)]  # wide views make known what lies beside the field
+    assert shares == [(0.25, 0.2), (0.25 / 0.8, 0.0)]  # offset views make known what lies beside the field
 
 
 def test_the_pass_before_wide_views_is_not_measured_again_and_they_are_among_the_views_of_the_volume(
     laws: Laws, follow: Callable[..., Followed]
 ) -> None:
-    wide = [replace(frame, kind=FrameKind.WIDE_VIEW, aside=18.0, index=14 + i) for i, frame in enumerate(FRAMES[4:7])]
-    scan = follow([*FRAMES[:14], *wide], (14, 17), wide_views=True)
+    wide = [replace(frame, kind=FrameKind.OFFSET_VIEW, aside=18.0, index=14 + i) for i, frame in enumerate(FRAMES[4:7])]
+    scan = follow([*FRAMES[:14], *wide], (14, 17), offset_views=True)
     for n in (14, 3):
         scan.seconds(n)
     assert laws.sizes == [[10], [10, 10]]

@@ -105,7 +105,9 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
 
     def choose(choice: Choice) -> None:
         chosen.append(choice)
-        event = NextChosen(1, 60, Choice.NEXT if choice is Choice.WIDE else choice, "operator", "because", (), time=1.0)
+        event = NextChosen(
+            1, 60, Choice.NEXT if choice is Choice.OFFSET else choice, "operator", "because", (), time=1.0
+        )
 
         def write() -> None:
             with (run / "events.jsonl").open("a") as log:
@@ -129,8 +131,8 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         twice = CliRunner().invoke(main, ["decide", "retake"])  # as the log has it from before
         assert twice.exit_code == 2 and "has chosen nothing since" in twice.stderr
         enter(State.ASKING)
-        other = CliRunner().invoke(main, ["decide", str(run), "wide"])
-        assert other.exit_code == 2 and "does not take wide" in other.stderr and "took next: because" in other.stderr
+        other = CliRunner().invoke(main, ["decide", str(run), "offset"])
+        assert other.exit_code == 2 and "does not take offset" in other.stderr and "took next: because" in other.stderr
         (run / "control" / "enough").touch()
     file.close()
     assert not (run / "control").exists()

@@ -100,7 +100,7 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
 def test_what_is_better_than_the_next_pass_is_measured_in_place_of_the_last_one(tmp_path: Path) -> None:
     noisy = live((0.1, 0.0, None), (0.1, 0.0, None), (0.1, 0.0, None))
     ran = Ran(
-        tmp_path, FakeInstrument(), *PASSES, "scan.wish={dose: 1}",
+        tmp_path, FakeInstrument(), *PASSES, "scan.target={dose: 1}",
         live=lambda scan, output: [word.replace('"noise": 0.1', '"noise": 0.8') for word in noisy(scan, output)],
     )  # fmt: skip
     assert ran.error is None
@@ -128,7 +128,7 @@ def test_where_nothing_can_be_predicted_the_plan_stays_as_it_is_and_one_sentence
         return replace(scan_info(config, instrument), source_distance_mm=10.0 if cone else None)
 
     monkeypatch.setattr(preflight, "scan_info", info)
-    ran = Ran(tmp_path, FakeInstrument(), *PASSES, "scan.wish={seconds: 1}", live=command)
+    ran = Ran(tmp_path, FakeInstrument(), *PASSES, "scan.target={seconds: 1}", live=command)
     assert ran.error is None
     ran.assert_good_file(19, "complete")
     ends, (only,) = written(ran)
@@ -208,7 +208,7 @@ def test_a_stop_or_an_abort_ends_the_question(tmp_path: Path, verb: str) -> None
 
 def test_a_resumed_run_goes_on_deciding_and_its_wish_counts_what_earlier_parts_took(tmp_path: Path) -> None:
     laws = live((1.0, 0.1, None), (1.0, 0.1, None), (1.0, 0.1, None))
-    stop, words = StopRequest(), (*PASSES, "scan.wish={seconds: 28}")
+    stop, words = StopRequest(), (*PASSES, "scan.target={seconds: 28}")
     ran = Ran(tmp_path, FakeInstrument(at={12: stop.stop}), *words, live=laws, stop=stop)  # in the third pass
     assert isinstance(ran.error, ScanStopped) and len(written(ran)[1]) == 2
     instrument, events = FakeInstrument(), list[Event]()
@@ -233,7 +233,7 @@ def test_a_choice_that_was_due_is_asked_for_before_any_frame_and_enough_takes_wh
     """Of a scan without references at its start, which is paused when it asks for the second time."""
     stop, events = StopRequest(), list[Event]()
     words = [*PASSES, "scan.decide=ask", "scan.wait_s=300", "scan.darks.at=none", "scan.flats.at=end"]
-    words += ["scan.wide_views=2", "sample.diameter_mm=0.9"]
+    words += ["scan.offset_views=2", "sample.diameter_mm=0.9"]
 
     def stop_when_asked(event: Event) -> None:
         if event.data.get("state") == State.ASKING:
@@ -263,7 +263,7 @@ def test_a_choice_that_was_due_is_asked_for_before_any_frame_and_enough_takes_wh
         done = run_scan(series.config, series, [react], instrument=instrument.connected(), live=words_of)
     assert seen == ["asking", "paused", "asking"] and done.status == "complete"
     kinds = [event.data["kind"] for event in events if event.event == "block_started"]
-    assert kinds == ["wide_view", "wide_view", "flat"]
+    assert kinds == ["offset_view", "offset_view", "flat"]
     with h5py.File(ran.folder / "joined.h5") as file:
         assert [json.loads(line)["number"] for line in file[layout.DECISIONS].asstr()[()]] == [1]
     with pytest.raises(NothingMissing), open_for_resume(ran.folder):

@@ -13,7 +13,7 @@ from beamline.core.event_lines import event_of
 from beamline.core.events import Event
 from beamline.core.recon_events import LawMeasured
 from beamline.core.stop import StopRequest
-from beamline.plan.choose import Wish
+from beamline.plan.choose import ScanTarget
 from beamline.plan.passes import Choice, Passes, pass_blocks
 from beamline.plan.timeline import block_seconds
 from beamline.scan.control import State, StateMachine
@@ -22,7 +22,7 @@ from beamline.scan.supervision import PAUSE_POLL
 from tests.beamline.fakes import FakeInstrument
 
 PASS_VIEWS = 12  # of each of four passes
-QUALITY = Wish(quality_db=1.0)
+QUALITY = ScanTarget(quality_db=1.0)
 
 
 def law(
@@ -38,10 +38,12 @@ def law(
 class Scan:
     """A decider in a scan that is stood still; `moments` happen one after the other while it waits."""
 
-    def __init__(self, wish: Wish = QUALITY, asks: bool = False, wait: float = 1.0, wide: int = 0, **more: Any) -> None:
+    def __init__(
+        self, target: ScanTarget = QUALITY, asks: bool = False, wait: float = 1.0, wide: int = 0, **more: Any
+    ) -> None:
         instrument = FakeInstrument()
         plan = replace(
-            instrument.plan(4 * PASS_VIEWS, passes=4), retake_share=0.25, wide_views=wide, wide_places=(1.0,)[:wide]
+            instrument.plan(4 * PASS_VIEWS, passes=4), retake_share=0.25, offset_views=wide, offset_places=(1.0,)[:wide]
         )
         self.timeline = instrument.worked_out(plan)
         self.moments: list[Callable[[], object]] = []
@@ -57,7 +59,7 @@ class Scan:
 
         self.now = 100.0
         self.decide = Decider(
-            asks=asks, wish=wish, wait=wait, timeline=self.timeline, seconds_of=seconds_of, now=lambda: self.now,
+            asks=asks, target=target, wait=wait, timeline=self.timeline, seconds_of=seconds_of, now=lambda: self.now,
             states=self.states, stop=self.stop, sink=self.events.append, began=90.0, **more,
             why_no_law=lambda: self.why_no_law, wait_a_moment=self.moment, record=self.recorded.append,
             close_shutter=lambda: self.log.append("close shutter"),
@@ -97,7 +99,7 @@ def test_it_waits_for_the_law_of_these_views_and_says_what_it_chose() -> None:
 
 
 def test_what_came_of_a_prediction_stands_beside_it() -> None:
-    scan = Scan(Wish(1.6))  # which it waits for a law to tell
+    scan = Scan(ScanTarget(1.6))  # which it waits for a law to tell
     scan.after(1, law(12, error=0.5))
     predicted = scan.chosen["options"][0]["gain"]
     scan.after(2, law(24, error=0.5, gained=2.5))
@@ -109,14 +111,14 @@ def test_what_came_of_a_prediction_stands_beside_it() -> None:
 
 
 def test_a_choice_before_the_first_frame_of_a_later_part_counts_the_seconds_of_earlier_ones() -> None:
-    scan = Scan(Wish(seconds=100.0), added_seconds=99.0)
+    scan = Scan(ScanTarget(seconds=100.0), added_seconds=99.0)
     scan.decide.began = math.inf
     assert scan.after(1, law(12)) is Choice.ENOUGH
     assert "next would end the scan after" in scan.chosen["reason"]
 
 
 def test_where_the_next_pass_is_sure_the_stage_does_not_wait_and_the_outcome_comes_later() -> None:
-    scan = Scan(Wish(1.0))
+    scan = Scan(ScanTarget(1.0))
     scan.after(1, law(12, exponent=2.0, noise=0.0))
     predicted = scan.chosen["options"][0]["gain"]
     assert scan.after(2) is Choice.NEXT and scan.waited == 0 and scan.chosen["by"] == "program"
@@ -124,7 +126,7 @@ def test_where_the_next_pass_is_sure_the_stage_does_not_wait_and_the_outcome_com
     scan.decide.add_law(
         law(24, exponent=2.0, noise=0.0, gained=5.0)
     )  # of the second pass, while the third one is taken
-    assert scan.after(3, law(36)) is Choice.NEXT and scan.waited == 1  # after the last one the wish may be met
+    assert scan.after(3, law(36)) is Choice.NEXT and scan.waited == 1  # after the last one the target may be met
     assert (scan.chosen["predicted"], scan.chosen["gained"], scan.chosen["judged"]) == (predicted, 5.0, 1)
 
 
@@ -136,10 +138,10 @@ def test_enough_is_chosen_with_its_reason_and_left_to_the_scan_to_do() -> None:
     assert scan.chosen["choice"] == "enough" and scan.recorded[0]["reason"] == scan.chosen["reason"]
 
 
-def test_the_seconds_of_a_wish_are_those_since_the_first_frame_and_what_follows() -> None:
+def test_the_seconds_of_a_target_are_those_since_the_first_frame_and_what_follows() -> None:
     takes = Scan().decide.seconds_of(pass_blocks(Scan().timeline.views, 0)[1])
     for added, choice in ((0.0, Choice.NEXT), (1.0, Choice.ENOUGH)):
-        scan = Scan(Wish(seconds=10.5 + takes), added_seconds=added)
+        scan = Scan(ScanTarget(seconds=10.5 + takes), added_seconds=added)
         assert scan.after(1, law(12)) is choice
 
 
@@ -147,15 +149,17 @@ def test_wide_views_count_as_taken_as_they_come_in_any_case() -> None:
     scan = Scan(wide=5)
     views, wide = pass_blocks(scan.timeline.views, 0)[1], next(block for block in scan.timeline.blocks if block.aside)
     takes = scan.decide.seconds_of(views) + scan.decide.seconds_of(wide)
-    for wish in (Wish(seconds=10 + takes), Wish(dose=29 / 53)):
+    for target in (ScanTarget(seconds=10 + takes), ScanTarget(dose=29 / 53)):
         for less, choice in ((0.999, Choice.ENOUGH), (1.001, Choice.NEXT)):
-            tried = Wish(seconds=wish.seconds and less * wish.seconds, dose=wish.dose and less * wish.dose)
+            tried = ScanTarget(
+                seconds=target.seconds and less * target.seconds, dose=target.dose and less * target.dose
+            )
             assert Scan(tried, wide=5).after(1, law(12)) is choice
 
 
 def test_what_wide_views_or_retakes_brought_is_not_measured_and_a_pass_has_a_range() -> None:
-    scan = Scan(Wish(0.01), asks=True, wide=5)
-    for choice, measured in ((Choice.WIDE, False), (Choice.RETAKE, False), (Choice.NEXT, True)):
+    scan = Scan(ScanTarget(0.01), asks=True, wide=5)
+    for choice, measured in ((Choice.OFFSET, False), (Choice.RETAKE, False), (Choice.NEXT, True)):
         scan.moments = [partial(scan.decide.add_law, law(12)), lambda: None]
         scan.moments += [partial(scan.decide.answer, choice)]
         assert scan.after(1, retakes=2) is choice and scan.chosen["passes"] == 1
@@ -165,12 +169,12 @@ def test_what_wide_views_or_retakes_brought_is_not_measured_and_a_pass_has_a_ran
 
 
 def test_retakes_of_earlier_parts_count_in_the_dose() -> None:
-    assert Scan(Wish(dose=0.75), retaken=2).after(2, law(24)) is Choice.ENOUGH
+    assert Scan(ScanTarget(dose=0.75), retaken=2).after(2, law(24)) is Choice.ENOUGH
 
 
 @pytest.mark.parametrize(("retaken", "choice"), [(0, Choice.NEXT), (2, Choice.ENOUGH)])
-def test_the_dose_of_a_wish_counts_retakes_that_were_chosen(retaken: int, choice: Choice) -> None:
-    scan = Scan(Wish(dose=0.75), asks=bool(retaken))
+def test_the_dose_of_a_target_counts_retakes_that_were_chosen(retaken: int, choice: Choice) -> None:
+    scan = Scan(ScanTarget(dose=0.75), asks=bool(retaken))
     if retaken:
         scan.moments = [lambda: scan.decide.add_law(law(24)), lambda: None]
         scan.moments += [lambda: scan.decide.answer(Choice.RETAKE)]
@@ -190,7 +194,7 @@ def test_a_late_law_means_the_plan_and_the_next_one_counts_again() -> None:
 
 
 def test_the_law_after_what_an_earlier_part_chose_has_no_prediction_beside_it() -> None:
-    scan = Scan(Wish(0.01), wait=0.2)
+    scan = Scan(ScanTarget(0.01), wait=0.2)
     scan.after(2, law(21, error=0.5, gained=1.0))  # of fewer views, as some were flagged
     assert (scan.chosen["number"], scan.chosen["by"], scan.chosen["judged"]) == (2, "program", 1)
     assert "predicted" not in scan.chosen
@@ -212,7 +216,7 @@ def test_a_dead_live_process_means_the_plan_and_is_said_once(asks: bool) -> None
 
 
 def test_a_law_of_before_does_not_serve_when_the_process_is_dead() -> None:
-    scan = Scan(Wish(1.0))
+    scan = Scan(ScanTarget(1.0))
     scan.after(1, law(12, exponent=2.0, noise=0.0))
     scan.why_no_law = "the live reconstruction has ended"
     assert scan.after(2) is Choice.NEXT and scan.chosen["by"] == "plan"
@@ -231,14 +235,14 @@ def test_a_stop_ends_every_wait(asks: bool) -> None:
 def test_the_operator_is_asked_with_a_closed_shutter() -> None:
     scan = Scan(asks=True, wait=60)
     scan.moments = [lambda: scan.decide.add_law(law(12)), lambda: None, lambda: None]
-    scan.moments += [lambda: scan.decide.answer(Choice.WIDE), lambda: scan.decide.answer(Choice.AGAIN)]
+    scan.moments += [lambda: scan.decide.answer(Choice.OFFSET), lambda: scan.decide.answer(Choice.AGAIN)]
     assert scan.after(1) is Choice.AGAIN
     assert scan.log == ["close shutter", "close shutter", "asking"]  # while it waits for the law, too
     (ended,) = scan.of("pass_ended")
     assert ended["wait"] == 60 and ended["recommended"] == "next"
     assert (scan.chosen["by"], scan.chosen["reason"]) == ("operator", "the operator chose it")
     (refused,) = scan.of("warning")
-    assert refused["message"] == "The choice wide changed nothing: expected again, enough, next."
+    assert refused["message"] == "The choice offset changed nothing: expected again, enough, next."
     scan.decide.answer(Choice.ENOUGH)  # too late
     assert scan.of("warning")[1]["message"] == "The choice enough changed nothing: the scan does not ask now."
     assert not scan.stop.stopping

@@ -30,7 +30,7 @@ def test_what_it_leaves_out_is_told_to_the_follower() -> None:
     assert words[words.index("--bin") + 1] == "4" and words[words.index("--views") + 1] == "every:2"
     assert "--bin" not in follow_command(small())(Path("scan.h5"), Path("recon.h5"))
     words = follow_command(small(), earlier=[Path("a.h5"), Path("b.h5")])(Path("c.h5"), Path("recon.h5"))
-    assert words[words.index("--follow") :][:5] == ["--follow", "--earlier", "a.h5", "--earlier", "b.h5"]
+    assert words[words.index("--follow") :][:5] == ["--follow", "--previous-part", "a.h5", "--previous-part", "b.h5"]
 
 
 READY = """print('{"event": "state", "state": "ready", "message": ""}', flush=True)\n"""

@@ -41,7 +41,7 @@ from tests.beamline.ran import Ran, killed
 
 FIRST, VIEWS = 5, 12  # 3 darks and 2 flats before the views
 WIDE = 4  # at two angles on either side
-WORDS = ("scan.wide_views=2", "sample.diameter_mm=0.9", "scan.settle_s=0", "scan.period_s=2")
+WORDS = ("scan.offset_views=2", "sample.diameter_mm=0.9", "scan.settle_s=0", "scan.period_s=2")
 MODES = {
     "fly": (("scan.mode=fly", "scan.angles={scheme: interlaced, views: 12, passes: 4}"), 0, [3, 3, 3, 3]),
     "step": (("scan.mode=step", "scan.pass_views=5"), 5, [5, 5, 2]),
@@ -50,7 +50,7 @@ MODES = {
 
 
 def expected(sizes: Sequence[int], answers: Sequence[Choice]) -> list[list[int]]:
-    """Triggers of each set that is chosen, wide views from VIEWS on; without retakes."""
+    """Triggers of each set that is chosen, offset views from VIEWS on; without retakes."""
     firsts = [sum(sizes[:i]) for i in range(len(sizes))]
     to_come = [list(range(first, first + n)) for first, n in zip(firsts, sizes, strict=True)]
     done, wide = [to_come.pop(0)], list(range(VIEWS, VIEWS + WIDE))
@@ -64,7 +64,7 @@ def expected(sizes: Sequence[int], answers: Sequence[Choice]) -> list[list[int]]
                 to_come.pop()
                 done.append(done[-1])
                 sets.append(done[-1])
-            case Choice.WIDE:
+            case Choice.OFFSET:
                 sets.append(wide)
                 wide = []
             case Choice.ENOUGH:
@@ -79,7 +79,7 @@ def frames_of(path: Path) -> list[Frame]:
 
 @pytest.mark.parametrize("mode", MODES)
 @settings(max_examples=8, deadline=None)
-@given(script=st.lists(st.sampled_from([Choice.NEXT, Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH])))
+@given(script=st.lists(st.sampled_from([Choice.NEXT, Choice.NEXT, Choice.AGAIN, Choice.OFFSET, Choice.ENOUGH])))
 def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> None:
     words, pass_views, sizes = MODES[mode]
     chooser = Scripted(script)
@@ -88,11 +88,11 @@ def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> N
         ran.assert_safe()
         sets = expected(sizes, chooser.answers)
         frames = frames_of(ran.folder / "scan.h5")
-        views = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
+        views = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.OFFSET_VIEW)]
         assert [frame.trigger for frame in views] == [trigger for triggers in sets for trigger in triggers]
-        assert all((frame.trigger >= VIEWS) is (frame.kind is FrameKind.WIDE_VIEW) for frame in views)
+        assert all((frame.trigger >= VIEWS) is (frame.kind is FrameKind.OFFSET_VIEW) for frame in views)
         assert len(views) <= VIEWS + WIDE and all(frame.replaces < 0 for frame in frames)
-        assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
+        assert_true(frame for frame in frames if frame.kind is not FrameKind.OFFSET_VIEW)
         assert [decode(frame.counts)[3] for frame in frames] == list(range(len(frames)))
         enough = Choice.ENOUGH in chooser.answers
         assert len(frames) == FIRST + len(views) + 2  # flats of the end
@@ -178,7 +178,7 @@ def test_a_stop_while_it_is_asked_ends_the_scan_and_a_closed_shutter_opens_again
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     instrument, stop = FakeInstrument(), StopRequest()
-    answers = iter([Choice.NEXT, Choice.WIDE, Choice.NEXT])
+    answers = iter([Choice.NEXT, Choice.OFFSET, Choice.NEXT])
 
     def close_and_choose(passes: object) -> Choice:
         instrument.devices.shutter.close()
@@ -189,7 +189,7 @@ def test_a_stop_while_it_is_asked_ends_the_scan_and_a_closed_shutter_opens_again
     with choosing(monkeypatch, close_and_choose):
         ran = Ran(tmp_path, instrument, *WORDS, *MODES["fly"][0], stop=stop)
     assert "Stopped after 9 of 12 projections: the operator asked" in str(ran.error)
-    assert_true(frame for frame in frames_of(ran.folder / "scan.h5") if frame.kind is not FrameKind.WIDE_VIEW)
+    assert_true(frame for frame in frames_of(ran.folder / "scan.h5") if frame.kind is not FrameKind.OFFSET_VIEW)
     ran.assert_safe()
 
 
@@ -197,9 +197,9 @@ def test_a_stop_in_the_wide_views_of_one_place_does_not_move_the_sample_to_the_n
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stop = StopRequest()
-    with choosing(monkeypatch, Scripted([Choice.WIDE])):
+    with choosing(monkeypatch, Scripted([Choice.OFFSET])):
         ran = Ran(tmp_path, FakeInstrument(at={FIRST + 3: stop.stop}), *WORDS, *MODES["fly"][0], stop=stop)
-    wide = [frame.trigger for frame in frames_of(ran.folder / "scan.h5") if frame.kind is FrameKind.WIDE_VIEW]
+    wide = [frame.trigger for frame in frames_of(ran.folder / "scan.h5") if frame.kind is FrameKind.OFFSET_VIEW]
     assert wide == [VIEWS]
 
 
@@ -235,17 +235,17 @@ def test_the_wide_views_after_enough_pause_and_end_as_those_of_any_scan(
     assert not stop.aborting and f"Stopped after {sizes[0]} of 12 projections: Ctrl-C was pressed." in str(ran.error)
     assert [frame.trigger for frame in frames_of(ran.folder / "scan.h5")[FIRST + sizes[0] :]] == [VIEWS]
     with open_for_resume(ran.folder) as series:
-        assert series.in_words.endswith("to take, its missing wide views and flats of the end are taken now")
+        assert series.in_words.endswith("to take, its missing offset views and flats of the end are taken now")
     assert "--resume" in next_step(ran.folder / "scan.h5")
 
 
-CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.WIDE, Choice.ENOUGH]), max_size=4)
+CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.OFFSET, Choice.ENOUGH]), max_size=4)
 
 
 @pytest.mark.parametrize("mode", ["fly", "step"])
 @settings(max_examples=4, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(script=CHOICES, cuts=st.lists(st.integers(FIRST, FIRST + VIEWS + WIDE - 1), min_size=1, max_size=2))
-@example(script=[Choice.ENOUGH], cuts=[FIRST + 6])  # in the wide views
+@example(script=[Choice.ENOUGH], cuts=[FIRST + 6])  # in the offset views
 def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script: list[Choice], cuts: list[int]) -> None:
     words, pass_views, sizes = MODES[mode]
     chooser = Scripted(script)
@@ -266,9 +266,9 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         sets = expected(sizes, chooser.answers)
         path = ran.folder / ("joined.h5" if (ran.folder / "joined.h5").exists() else "scan.h5")
         frames = frames_of(path)
-        rows = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.WIDE_VIEW)]
+        rows = [frame for frame in frames if frame.kind in (FrameKind.PROJECTION, FrameKind.OFFSET_VIEW)]
         assert [frame.trigger for frame in rows] == [trigger for triggers in sets for trigger in triggers]
-        assert_true(frame for frame in frames if frame.kind is not FrameKind.WIDE_VIEW)
+        assert_true(frame for frame in frames if frame.kind is not FrameKind.OFFSET_VIEW)
         with h5py.File(path) as file:
             ends, decisions = pass_ends_in(file), decisions_in(file)
             assert ending_in(file).missing == ()
@@ -288,7 +288,7 @@ def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
         ran = Ran(tmp_path, FakeInstrument(at={FIRST + VIEWS + 1: stop.abort}), *WORDS, *words, stop=stop)
     instrument.clock.sleep(1e4)
     with open_for_resume(ran.folder) as series:
-        assert series.in_words.endswith("has all 12 views, its missing wide views of the end are taken now")
+        assert series.in_words.endswith("has all 12 views, its missing offset views of the end are taken now")
         run_scan(series.config, series, instrument=instrument.connected())
     frames = frames_of(ran.folder / "joined.h5")
     assert [frame.trigger for frame in frames[FIRST:]] == list(range(VIEWS + WIDE))
@@ -379,12 +379,12 @@ def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
 ) -> None:
     """By validate, by a copy, by the monitor over the file, and by a reconstruction."""
     words = ("scan.mode=fly", "scan.angles={scheme: interlaced, views: 32, passes: 4}", "scan.period_s=0.4")
-    wide = ("scan.wide_views=2", "sample.diameter_mm=0.9")
-    chooser = Scripted([Choice.AGAIN, Choice.WIDE])
+    wide = ("scan.offset_views=2", "sample.diameter_mm=0.9")
+    chooser = Scripted([Choice.AGAIN, Choice.OFFSET])
     with choosing(monkeypatch, chooser):
         ran = Ran(tmp_path / "runs", FakeInstrument(), *words, *wide)
     path = ran.result.path
-    assert chooser.answers == [Choice.AGAIN, Choice.WIDE, Choice.NEXT, Choice.NEXT]
+    assert chooser.answers == [Choice.AGAIN, Choice.OFFSET, Choice.NEXT, Choice.NEXT]
     assert ran.result.flags == {}
     ingest(path, tmp_path / "copy.h5")
     for file in (path, tmp_path / "copy.h5"):

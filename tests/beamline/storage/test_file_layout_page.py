@@ -49,7 +49,7 @@ def whole_scan(tmp_path: Path) -> list[Path]:
         "s", pixel_size_mm=0.5, energy_kev=20.0, distance_mm=900.0, exposure=0.1, period=0.2, axis_col=20.7,
         source_distance_mm=1e4, devices={"stage": {"model": "m"}}, beam_unit="A", filter="Al",
         monochromator_kev=20.0, plan=json.dumps(plan), saturation=4095.0,
-        wide_views=True, decides=True,
+        offset_views=True, decides=True,
     )  # fmt: skip
     frames = frames_of(SCAN)
     frames.append(replace(frames[-1], index=len(frames), kind=FrameKind.ALIGNMENT))

@@ -43,7 +43,7 @@ def assert_same(one: FrameTable, other: FrameTable, but: tuple[str, ...] = ("fla
 
 
 def test_kinds_are_asked_by_name(table: FrameTable) -> None:
-    assert (table.darks.tolist(), table.flats.tolist(), table.wide_views.tolist()) == ([0], [1, 6], [10])
+    assert (table.darks.tolist(), table.flats.tolist(), table.offset_views.tolist()) == ([0], [1, 6], [10])
     assert table.views.tolist() == np.flatnonzero(table.are_views).tolist() == [2, 3, 5, 7, 9, 11]
     assert table.views_of(3, 9).tolist() == [3, 5, 7]
     assert table.of_kind(FrameKind.DARK, FrameKind.FLAT).tolist() == [0, 1, 6]

@@ -257,7 +257,7 @@ def test_the_field_holds_every_ray_and_no_more(
     rows: int, cols: int, axis: tuple[float, float], pitch: float, coarser: float,
     shifts: list[tuple[float, float]], cone: bool,
 ) -> None:  # fmt: skip
-    shifts = [(col * cols / 2, row) for col, row in shifts]  # farther aside would be wide views
+    shifts = [(col * cols / 2, row) for col, row in shifts]  # farther aside would be offset views
     angles = 0.7 * np.arange(len(shifts))
     how: dict[str, Any] = {"axis_row": axis[1], "shifts": shifts}
     if cone:

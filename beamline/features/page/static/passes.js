@@ -1,6 +1,6 @@
 // What can be measured after a pass, side by side; buttons that answer while the scan asks; what was chosen so far.
 
-const MEANINGS = { next: "the next pass of the plan", again: "the last angles again", wide: "wide views", retake: "bad views again", enough: "no further pass" };
+const MEANINGS = { next: "the next pass of the plan", again: "the last angles again", offset: "offset views", retake: "bad views again", enough: "no further pass" };
 const CHOSEN_BY = { program: "program", operator: "operator", plan: "nobody: as planned" };
 
 export class Passes {

@@ -148,7 +148,7 @@ def test_a_client_reads_what_can_be_measured_next_and_answers(tmp_path: Path) ->
             client.put("T:Decide", "next", timeout=WITHIN)
         with asking(run) as answers:
             with pytest.raises(thread.RemoteError, match="'wide' cannot be chosen now; on offer: next, enough"):
-                client.put("T:Decide", "wide", timeout=WITHIN)
+                client.put("T:Decide", "offset", timeout=WITHIN)
             _put(server, client, "T:Decide", "enough")
             assert answers == ["enough"] and client.get("T:Decide") == ""
             with pytest.raises(thread.RemoteError, match="does not ask"):

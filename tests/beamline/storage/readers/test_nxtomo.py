@@ -39,7 +39,7 @@ def scans(draw: st.DrawFn) -> list[Frame]:
             angle=draw(st.floats(-20, 20) | st.just(np.nan)),
             time=draw(st.floats(0, 4e9)),
             exposure=draw(st.floats(1e-6, 1e4)),
-            aside=draw(st.floats(0.1, 9)) if kind is FrameKind.WIDE_VIEW else 0.0,
+            aside=draw(st.floats(0.1, 9)) if kind is FrameKind.OFFSET_VIEW else 0.0,
         )
         for i in range(draw(st.integers(0, 6)))
     ]
@@ -51,7 +51,7 @@ def test_replay_yields_the_same_frames(frames: list[Frame], flush_every: int) ->
     shape = frames[0].counts.shape if frames else (2, 3)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scan.h5"
-        info = replace(INFO, wide_views=True)
+        info = replace(INFO, offset_views=True)
         with NXtomoWriter(path, info, shape, clock=SteppedClock(EPOCH), flush_every=flush_every) as writer:
             for frame in frames:
                 writer.append(frame, digest(frame.counts))

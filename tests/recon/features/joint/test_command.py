@@ -1,4 +1,4 @@
-"""`beamline recon --time N`: a cylinder that fades, from the scan to volumes in time, and what reads these."""
+"""`beamline recon --volumes N`: a cylinder that fades, from the scan to volumes in time, and what reads these."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_flag
 
 VIEWS, SPAN = 36, 3.5  # s from the first view to the last
 SCAN = TwoCylinders(np.radians(np.arange(VIEWS) * 111.246), (2, 40), axis_col=19.5)
-ASKED = "--time", "2", "--no-moves", "--set", "sweeps=30"
+ASKED = "--volumes", "2", "--no-moves", "--set", "sweeps=30"
 FADED = 0.5  # of the attenuation of all, at the last view
 
 
@@ -146,18 +146,22 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (("--time", "3", "--follow"), 2, "--time does not go with --follow"),
-        (("--time", "3", "-m", "fbp"), 2, "--time is of series; it does not go with --method fbp"),
-        (("--time", "3", "--uncertainty"), 2, "error bars belong to one volume"),
-        (("--time", "3", "--roi", "0:1,0:9,0:9"), 2, "a box belongs to one volume"),
-        (("--time", "3", "-o", "series.tif"), 2, "ends in .h5"),
-        (("--time", "1"), 2, "--time"),
-        (("--moves",), 2, "give --time N"),
-        (("--time", "4", "--no-moves"), 5, "12 views or more for each"),
-        (("--time", "2", "--memory", "100K"), 2, "may be used. Volumes in time are not made in slabs: give --bin"),
-        (("--time", "2", "--memory", "300K"), 2, "made in slabs: give --rows with 1 row or fewer at a time, or --bin"),
-        (("--time", "4", "--dry-run"), 5, "4 volumes of 36 views: expected 12 views or more for each"),
-        (("--time", "2", "--memory", "100K", "--dry-run"), 2, "may be used. Volumes in time are not made in slabs"),
+        (("--volumes", "3", "--follow"), 2, "--volumes does not go with --follow"),
+        (("--volumes", "3", "-m", "fbp"), 2, "--volumes is of series; it does not go with --method fbp"),
+        (("--volumes", "3", "--uncertainty"), 2, "error bars belong to one volume"),
+        (("--volumes", "3", "--roi", "0:1,0:9,0:9"), 2, "a box belongs to one volume"),
+        (("--volumes", "3", "-o", "series.tif"), 2, "ends in .h5"),
+        (("--volumes", "1"), 2, "--volumes"),
+        (("--moves",), 2, "give --volumes N"),
+        (("--volumes", "4", "--no-moves"), 5, "12 views or more for each"),
+        (("--volumes", "2", "--memory", "100K"), 2, "may be used. Volumes in time are not made in slabs: give --bin"),
+        (
+            ("--volumes", "2", "--memory", "300K"),
+            2,
+            "made in slabs: give --rows with 1 row or fewer at a time, or --bin",
+        ),
+        (("--volumes", "4", "--dry-run"), 5, "4 volumes of 36 views: expected 12 views or more for each"),
+        (("--volumes", "2", "--memory", "100K", "--dry-run"), 2, "may be used. Volumes in time are not made in slabs"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(
@@ -173,11 +177,11 @@ def test_a_dry_run_states_the_memory_and_writes_nothing(
     scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    done = beamline("recon", str(scan), "--time", "2", "--dry-run")
+    done = beamline("recon", str(scan), "--volumes", "2", "--dry-run")
     assert done.exit_code == 0, done.output
     assert f"{'volumes':<10}2 of 2 x 40 x 40 voxels by series, from 36 views" in done.output
     assert "not known: series has to be tried" in done.output.splitlines()[-1]
-    told = json.loads(beamline("recon", str(scan), "--time", "2", "--dry-run", "--json").stdout)
+    told = json.loads(beamline("recon", str(scan), "--volumes", "2", "--dry-run", "--json").stdout)
     assert told["seconds"] is None and told["time"] > 1e9  # of the event
     assert not left(tmp_path)
 

@@ -1,4 +1,4 @@
-"""Wide views: the sample is stepped across the beam after the views, so that frames side by side show all of it."""
+"""Offset views: the sample is stepped across the beam after the views, so that frames side by side show all of it."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamline.config.load import plan_of, wide_places
+from beamline.config.load import offset_places, plan_of
 from beamline.config.models import Config
 from beamline.core.errors import ConfigError, ScanStopped
 from beamline.core.events import Event
@@ -57,9 +57,9 @@ SHORT = (
     "devices.camera.roi=[1136, 2028, 32, 40]", "simulation.clock=virtual", "recon.live=false", "scan.mode=step",
     "scan.period_s=0.6", "devices.stage.low_deg=-60",
 )  # fmt: skip
-WIDE = ("scan.wide_views=2", f"sample.diameter_mm={2.8 * FIELD}")
+WIDE = ("scan.offset_views=2", f"sample.diameter_mm={2.8 * FIELD}")
 STEPS = (-1.8, -0.9, 0.9, 1.8)  # fields
-FIRST = 4 + VIEWS  # row of the first wide view
+FIRST = 4 + VIEWS  # row of the first offset view
 
 
 def motor(mm_per_deg: float, high: float = 25) -> str:
@@ -86,16 +86,16 @@ def prepared(path: Path) -> tuple[PreparedProjections, list[str]]:
     [(1.05, 1), (1.5, 1), (2.6, 1), (2.8, 2), (4.4, 2), (4.6, 3)],
 )
 def test_the_sample_stands_at_every_nine_tenths_of_the_field_until_air_shows(fields: float, steps: int) -> None:
-    places = wide_places(asked("scan.wide_views=4", f"sample.diameter_mm={fields * FIELD}"))
+    places = offset_places(asked("scan.offset_views=4", f"sample.diameter_mm={fields * FIELD}"))
     expected = [0.9 * FIELD * k for k in range(-steps, steps + 1) if k]
     assert places == pytest.approx(expected)
     assert places[-1] + FIELD / 2 >= fields * FIELD / 2 + 0.05 * FIELD > places[-1] - 0.9 * FIELD + FIELD / 2
 
 
 def test_an_axis_beside_the_middle_takes_more_steps() -> None:
-    words = ("scan.wide_views=4", f"sample.diameter_mm={2.6 * FIELD}")
-    assert len(wide_places(asked(*words))) == 2
-    assert len(wide_places(asked(*words, "optics.axis_col=25"))) == 4
+    words = ("scan.offset_views=4", f"sample.diameter_mm={2.6 * FIELD}")
+    assert len(offset_places(asked(*words))) == 2
+    assert len(offset_places(asked(*words, "optics.axis_col=25"))) == 4
 
 
 def test_the_dry_run_counts_them() -> None:
@@ -107,7 +107,7 @@ def test_the_dry_run_counts_them() -> None:
     # Eight frames, and moves by 165 and then seven times 90 degrees at 30 degrees a second, less the way home from 165.
     assert wide.timeline.duration - plain.timeline.duration == pytest.approx(32, abs=6)
     text = "\n".join(lines_of(wide.plan, wide.timeline, wide.stage, wide.camera))
-    assert text.count("wide_view") == 4
+    assert text.count("offset_view") == 4
     assert "-0.3312, -0.1656, +0.1656, +0.3312 mm across the beam" in text
     assert plan_of(asked(*WIDE)).n_views == VIEWS
 
@@ -115,12 +115,12 @@ def test_the_dry_run_counts_them() -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("scan.wide_views=4",), "set sample.diameter_mm"),
+        (("scan.offset_views=4",), "set sample.diameter_mm"),
         ((*WIDE, "devices.sample_mover={kind: stage, in_deg: 1, out_deg: 12, stage: "
           f"{{kind: epics, port: 'sim://epics', {COMMON}}}}}"), "set its kind to stage, and its mm_per_deg"),
-        (("scan.wide_views=4", "sample.diameter_mm=0.1"), "field of 0.184 mm shows all of a sample of 0.1 mm"),
+        (("scan.offset_views=4", "sample.diameter_mm=0.1"), "field of 0.184 mm shows all of a sample of 0.1 mm"),
         ((*WIDE, motor(0.01)), r"place for -0.3312 mm aside, -32.12 is beyond the limits of its stage, -20 ... 25"),
-        (("scan.wide_views=4", "sample.diameter_mm=0"), "sample.diameter_mm"),
+        (("scan.offset_views=4", "sample.diameter_mm=0"), "sample.diameter_mm"),
     ],
     ids=["no diameter", "no axis", "all in the field", "out of reach", "no size"],
 )  # fmt: skip
@@ -132,7 +132,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(words: tuple[str, ...], said: s
 
 def test_a_cone_is_refused() -> None:
     cone = {**SCENE, "beam": {"photons_per_s": 1e5, "sod": 50.0, "sdd": 100.0}}
-    with pytest.raises(ConfigError, match="wide_views is for a parallel beam"):
+    with pytest.raises(ConfigError, match="offset_views is for a parallel beam"):
         dry_run(with_scene(asked(*WIDE), cone))
 
 
@@ -152,7 +152,7 @@ def test_triggers_frames_and_rows_are_one(words: tuple[str, ...], tmp_path: Path
         assert file[layout.ANGLE][rows] == pytest.approx(np.tile([0, 90], 4), abs=1e-3)
         assert len(file["/exchange/data"]) == VIEWS
         assert {len(file[path]) for path in (layout.DATA, *layout.growing(file))} == {scan.n_frames}
-    assert describe(scan.path)["kinds"] == {"projection": VIEWS, "wide_view": 8, "flat": 4, "dark": 2}
+    assert describe(scan.path)["kinds"] == {"projection": VIEWS, "offset_view": 8, "flat": 4, "dark": 2}
     assert [finding for finding in validate(scan.path) if finding.severity == "error"] == []
     with h5py.File(scan.path, "r+") as file:  # a view that was taken again before them has the trigger of the first
         file[layout.TRIGGER][FIRST - 1], file[layout.FRAMESTAMP][FIRST - 1] = file[layout.TRIGGER][FIRST], 0
@@ -210,7 +210,7 @@ def test_stepped_views_of_another_program_come_by_poses(tmp_path: Path) -> None:
     assert other.projections.data == pytest.approx(views.projections.data)
 
 
-@pytest.mark.parametrize("at", ["projection", "wide_view"])
+@pytest.mark.parametrize("at", ["projection", "offset_view"])
 def test_a_scan_that_is_resumed_has_them_and_its_copy_too(at: str, tmp_path: Path) -> None:
     stop = StopRequest()
 
@@ -222,7 +222,7 @@ def test_a_scan_that_is_resumed_has_them_and_its_copy_too(at: str, tmp_path: Pat
         run_scan(asked(*WIDE), tmp_path, [hear], stop)
     (folder,) = tmp_path.iterdir()
     with open_scan(folder / "scan.h5") as source:
-        assert ((source.table.kinds == FrameKind.PROJECTION).sum() == VIEWS) == (at == "wide_view")
+        assert ((source.table.kinds == FrameKind.PROJECTION).sum() == VIEWS) == (at == "offset_view")
     with open_for_resume(folder) as series:
         joined = run_scan(series.config, series, []).path
     ingest(joined, tmp_path / "copy.h5")
