@@ -73,6 +73,7 @@ def test_about_two_of_three_voxels_of_the_truth_are_within(made: Path) -> None:
     assert 0.5 < within.mean() < 0.9
 
 
+@pytest.mark.slow
 def test_in_slabs_it_is_the_same(made: Path, folder: Path) -> None:
     whole, slabs = read_reconstruction(made / "fbp.h5").deviation, deviation(*FBP, "--memory", "4.1M")
     assert whole is not None
@@ -80,6 +81,7 @@ def test_in_slabs_it_is_the_same(made: Path, folder: Path) -> None:
     assert left(folder) == {"scan.h5"}
 
 
+@pytest.mark.slow
 def test_of_a_box_it_is_the_box(made: Path, folder: Path) -> None:
     whole, box = read_reconstruction(made / "fista-tv.h5").deviation, deviation(*FISTA, "--roi", "20:30,4:20,6:22")
     assert whole is not None

@@ -89,6 +89,7 @@ def test_constant_projections_leave_all_finite_and_are_explained_where_they_can_
     assert np.isfinite(fbp(np.ones((32, *SHAPE), np.float32), VIEWS, GRID)).all()
 
 
+@pytest.mark.slow
 def test_counts_of_zero_and_saturated_ones_become_line_integrals_that_fit(clean: F32, truth: F32) -> None:
     rng = np.random.default_rng(1)
     good = rng.poisson(20_000 * np.exp(-clean)) + 100
@@ -125,7 +126,7 @@ def of_all_but_one(clean: F32) -> F32:
         return fitted(without, steps=60, finish=0).volume.data
 
 
-@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3], 2))
+@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3]))
 def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, of_all_but_one: F32, value: float) -> None:
     # It may have no part in where the first Gaussians are placed, nor in how dense they are.
     wild = clean.copy()
@@ -157,6 +158,7 @@ def test_one_view_is_refused_by_name_but_no_step_breaks_on_it(clean: F32) -> Non
     assert float(state.residual) < 0.5
 
 
+@pytest.mark.slow
 def test_equal_angles_count_as_one_place(clean: F32, truth: F32) -> None:
     with pytest.raises(ValueError, match="2 views from one side"):
         reconstruct(clean[[0, 0]], VIEWS.select([0, 0]))
@@ -217,6 +219,7 @@ def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
     assert varied[1] < 0.7 * varied[0]
 
 
+@pytest.mark.slow
 def test_photon_starved_views_give_a_volume_and_a_better_one_than_fbp(clean: F32, truth: F32) -> None:
     # With three photons a pixel, some count none at all: their line integral is -log(floor), and finite.
     rng, photons = np.random.default_rng(6), 3

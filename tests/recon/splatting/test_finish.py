@@ -102,6 +102,7 @@ def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
     np.testing.assert_allclose(weighed, volumes[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_reconstruct_finishes_and_says_so() -> None:
     data = Projector(VIEWS, GRID).forward(_box())
     plain, finished = (reconstruct(data, VIEWS, R2(steps=60, gaussians=300, finish=n)) for n in (0, 5))
@@ -112,6 +113,7 @@ def test_reconstruct_finishes_and_says_so() -> None:
     np.testing.assert_array_equal(plain.gaussians.means, finished.gaussians.means)
 
 
+@pytest.mark.slow
 def test_a_crack_that_the_fit_fills_is_opened_again() -> None:
     views = Geometry.parallel(np.linspace(0, math.pi, 60, endpoint=False), (8, 64))
     grid = Grid.matching(views)
@@ -159,6 +161,7 @@ def test_matter_above_and_below_a_cone_stays_out_of_the_end_slices() -> None:
     assert min(psnr(truth, found), psnr(truth, fitted)) > psnr(truth, raw) + 10
 
 
+@pytest.mark.slow
 def test_coarse_voxels_get_the_mean_over_their_edges() -> None:
     # Voxels of three pixels: a blob of four pixels is no sum of them.
     grid = Grid((4, 14, 14), 3.0)
