@@ -88,6 +88,7 @@ def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:
     assert psnr(missing + _of(g, small).data, finished.data) > 30
 
 
+@pytest.mark.slow
 def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
     g = _blob(8.0)
     data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(_box())
@@ -174,6 +175,7 @@ def test_coarse_voxels_get_the_mean_over_their_edges() -> None:
     assert psnr(truth, found) > psnr(truth, raw) and psnr(truth, found) > psnr(truth, volume.data) + 1.5
 
 
+@pytest.mark.slow
 def test_single_wild_rays_spoil_neither_the_fit_nor_its_finish() -> None:
     g = _blob(8.0)
     data = project(g, VIEWS).numpy() + 0.1 * Projector(VIEWS, GRID).forward(_box())
