@@ -137,7 +137,7 @@ class Waits:
         next(self.scan, None)
 
 
-@pytest.mark.parametrize("close", [True, False])
+@pytest.mark.parametrize("close", others_slow([False, True]))
 def test_a_growing_file_is_followed_to_its_end(tmp_path: Path, close: bool) -> None:
     frames = frames_of(SCAN)
     frames[9] = replace(frames[9], counts=frames[8].counts)
