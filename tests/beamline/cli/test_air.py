@@ -83,6 +83,7 @@ def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict
     assert "Background" not in said and record == "no surface taken off, a line through the air at the edges"
 
 
+@pytest.mark.slow
 def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path]) -> None:
     whole = _prepared(scans["bent"])
     buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7)
