@@ -1,4 +1,5 @@
-"""Simulated Zaber on its wire: packets by published test vectors, settings, motion, and the rules of triggers."""
+"""Simulated Zaber on its wire: the rules of triggers and outputs, and what it refuses. The tests of the driver and the
+library of the vendor ask the rest of it."""
 
 from __future__ import annotations
 
@@ -112,6 +113,47 @@ def test_predicted_edges_happen() -> None:
         wire.tell("/1")
     assert triggers.edges == predicted
     assert len(predicted) == 7
+
+
+def test_a_scheduled_value_comes_after_its_time_and_a_new_one_cancels_it(wire: Wire) -> None:
+    wire.do("io set do 1 1 schedule 20 0")
+    wire.clock.sleep(0.019)
+    assert wire.data("io get do 1") == "1"
+    wire.clock.sleep(0.002)
+    assert wire.data("io get do") == "0 0 0 0"
+    wire.do("io set do 1 1 schedule 20 0", "io set do 1 1")
+    wire.clock.sleep(1.0)
+    assert wire.data("io get do 1") == "1"
+    assert [round(pulse.time, 6) for pulse in wire.pulses()] == [0.0, 0.021]
+
+
+@pytest.mark.parametrize(
+    "packet", [b"/1:00", b"/1:C", b"/1:", b"x/1", b"/1 \xff", b"1 home", b"@01 1 OK", b"/1 " + b"w " * 40]
+)
+def test_a_packet_that_is_damaged_gets_no_answer_and_the_next_one_does(wire: Wire, packet: bytes) -> None:
+    wire.box.receive(packet + b"\n")
+    assert wire.box.transmit() == b""
+    assert wire.ask("/1 1") == "@01 1 OK IDLE -- 0"
+
+
+@pytest.mark.parametrize(
+    ("packet", "reason"),
+    [
+        ("/1 1 set maxspeed 0", "BADDATA"),
+        ("/1 1 set maxspeed fast", "BADDATA"),
+        ("/1 1 set pos 5", "BADCOMMAND"),
+        ("/1 1 get version", "DEVICEONLY"),
+        ("/1 1 move abs 2000000001", "BADDATA"),
+        ("/1 1 move abs", "BADCOMMAND"),
+        ("/1 0 trigger 7 enable", "BADDATA"),
+        ("/1 0 trigger 1 enable", "BADDATA"),
+        ("/1 0 trigger 1 when 1 dist 0", "BADDATA"),
+        ("/1 0 trigger 1 action a fly", "BADDATA"),
+        ("/1 0 io set do 5 1", "BADCOMMAND"),
+    ],
+)
+def test_what_it_cannot_do_is_rejected_with_the_reason(wire: Wire, packet: str, reason: str) -> None:
+    assert wire.ask(packet).endswith(f"RJ IDLE -- {reason}")
 
 
 class Passing(VirtualClock):
