@@ -1,12 +1,16 @@
-"""Dummies of each kind of extension: files, lines of registries, and a program that proves that it works."""
+"""Extensions of each kind: files, lines of registries, and a program that proves that it works. But for the stage they
+are those of the site's package (tests/site), each in the place of one of ours."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+
+SITE = Path(__file__).parent / "site" / "site_of_an_instrument"
 
 
 @dataclass(frozen=True)
 class Extension:
-    """A dummy.
+    """An extension.
 
     Attributes:
         files: its own, by path.
@@ -19,41 +23,17 @@ class Extension:
     proof: str
 
 
+def site(module: str) -> str:
+    return (SITE / f"{module}.py").read_text(encoding="utf-8")
+
+
 METHOD = Extension(
-    {
-        "recon/voxels/grey.py": """
-from dataclasses import dataclass
-from typing import ClassVar
-
-import numpy as np
-
-from recon.base.method import Reconstruction
-from recon.base.method_kinds import Direct
-from recon.base.volume import Volume
-
-
-@dataclass(frozen=True)
-class Grey(Direct):
-    name: ClassVar[str] = "grey"
-    label: ClassVar[str] = "Grey"
-    iterations: int = 1
-    shade: float = 0.5
-
-    def run(self, problem, control):
-        return Reconstruction(Volume(np.full(problem.grid.shape, self.shade, np.float32), problem.grid), {})
-
-    def toy(self):
-        return self
-
-    def memory(self, geometry, grid, weighted):
-        return 4 * grid.shape[0] * grid.shape[1] * grid.shape[2]
-"""
-    },
+    {"recon/voxels/mean.py": site("methods")},
     (
         (
             "recon/methods.py",
             '    "fbp": MethodEntry("recon.voxels.direct", "Fbp"),',
-            '    "grey": MethodEntry("recon.voxels.grey", "Grey"),',
+            '    "mean": MethodEntry("recon.voxels.mean", "Mean"),',
         ),
     ),
     """
@@ -67,52 +47,27 @@ from beamline.reconstruct.scan_facts import label_of
 from beamline.features.trials.tradeoff import plan
 from recon import methods
 
+from recon.voxels import mean
+
+mean.direct = lambda views, geometry, grid, name: np.full(grid.shape, {"ram-lak": 3, "hann": 1}[name])
 views, data = recon.Geometry.parallel([0.0, 1.0], (2, 3)), np.ones((2, 2, 3))
-for method in ("grey", recon.Grey()):
-    assert (recon.reconstruct(data, views, method).volume.data == 0.5).all()
-white = methods.build(methods.by_name("grey"), {"shade": 1.0})
-assert (recon.reconstruct(data, views, white).volume.data == 1).all()
-trials = plan(("grey", "fbp"), 60, "quick")
-labels = {t.label for t in trials if t.method == "grey"}
-assert labels == {"grey, 60 views", "grey, 30 views"}, labels
+for method in ("mean", recon.Mean()):
+    assert (recon.reconstruct(data, views, method).volume.data == 2).all()
+sharp = methods.build(methods.by_name("mean"), {"share": 1.0})
+assert (recon.reconstruct(data, views, sharp).volume.data == 3).all()
+trials = plan(("mean", "fbp"), 60, "quick")
+labels = {t.label for t in trials if t.method == "mean"}
+assert labels == {"mean, 60 views", "mean, 30 views"}, labels
 for offered in (command, tradeoff):
-    assert "grey" in CliRunner().invoke(offered, ["--help"]).output
-assert "grey" in taking("iterations") and "grey" not in taking("tv_weight")
-assert label_of("grey") == "Grey"
+    assert "mean" in CliRunner().invoke(offered, ["--help"]).output
+assert "mean" in taking("share") and "mean" not in taking("tv_weight")
+assert label_of("mean") == "Mean of two"
 """,
 )
 
 CHECK = Extension(
-    {
-        "beamline/monitor/dummy.py": '''
-"""A check that flags every second frame."""
-
-from dataclasses import dataclass
-from typing import ClassVar
-
-from beamline.monitor.check import Flag, Level, CheckResult, Policy
-from recon.base.setting import setting
-
-
-@dataclass(frozen=True)
-class Dummy:
-    name: ClassVar[str] = "dummy"
-    bit: ClassVar[int] = 47
-    unit: ClassVar[str] = "frames"
-    meaning: ClassVar[str] = "the frame is one of a pair"
-    policy: ClassVar[Policy] = Policy.LOG
-    every: int = setting(3, "frames between two flags", ge=2)
-
-    def start(self):
-        return 0
-
-    def look(self, state, frame, digest, context):
-        if (state + 1) % self.every:
-            return CheckResult(state + 1)
-        return CheckResult(state + 1, Flag(self.name, Level.ALARM, frame.index, state + 1, self.every, "Do nothing."))
-'''
-    },
-    (("beamline/monitor/checks.py", '    "DarkCheck": "frames",', '    "Dummy": "dummy",'),),
+    {"beamline/monitor/half.py": site("checks")},
+    (("beamline/monitor/checks.py", '    "DarkCheck": "frames",', '    "Half": "half",'),),
     """
 from beamline.config.load import config_folder, load
 from beamline.core.errors import ConfigError
@@ -125,53 +80,34 @@ words = ["simulation.clock=virtual", "scan.angles.views=6", "devices.camera.roi=
 words += ["scan.darks.count=2", "scan.flats.count=2", "scan.flats.at=start", "scan.period_s=2", "scan.mode=step"]
 path = config_folder() / "demo.yaml"
 try:
-    load(path, ["monitor.dummy.every=1"], {})
+    load(path, ["monitor.half.share=0"], {})
 except ConfigError as error:
     refused = str(error)
-config, flags = load(path, [*words, "monitor.dummy.every=2"], {}), []
+config, flags = load(path, [*words, "monitor.half.share=0.99"], {}), []
 sinks = [lambda event: flags.append(event.data.get("check"))]
 result = run_scan(config, Path("runs"), sinks)
 with h5py.File(result.path) as file:
     legend = file["entry/frame_log/flag_legend"]
-    row = list(legend["name"].asstr()[()]).index("dummy")
+    row = list(legend["name"].asstr()[()]).index("half")
     said = [int(legend[name][row]) for name in ("bit", "alarm_bit")]
     said += [legend[name].asstr()[row] for name in ("unit", "meaning")]
     bits = [int(b) & (1 << 47 | 1 << 63) for b in file["entry/frame_log/flags"][()]]
 info = describe(result.path)["flags"]
-assert "monitor.dummy.every is 1; expected a whole number >= 2" in refused
-assert result.flags["dummy"] == {"alarm": 5} and "dummy" in flags
-assert said == [47, 63, "frames", "the frame is one of a pair"]
-assert bits == [0, 1 << 47 | 1 << 63] * 5
-assert info["dummy"] == {"alarm": 5}
+assert "monitor.half.share is 0; expected a number > 0" in refused, refused
+assert result.flags["half"] == {"warn": 6} and "half" in flags, result.flags
+assert said == [47, 63, "share", "the frame has far less light than one before it"], said
+assert bits == [0] * 4 + [1 << 47] * 6, bits
+assert info["half"] == {"warn": 6}
 """,
 )
 
 EFFECT = Extension(
-    {
-        "simulators/effects/half.py": """
-from dataclasses import dataclass
-from typing import ClassVar
-
-from simulators.effects.catalogue import Domain
-
-
-@dataclass(frozen=True)
-class Half:
-    factor: float = 0.5
-    name: ClassVar[str] = "half"
-    domain: ClassVar[Domain] = Domain.PHOTONS
-    final: ClassVar[bool] = False
-
-    def apply(self, image, shot):
-        image *= self.factor
-        return image
-"""
-    },
+    {"simulators/effects/dimmed.py": site("effects")},
     (
         (
             "simulators/effects/catalogue.py",
             '        "photon_noise": _sensor(Domain.PHOTONS, "photons arrive at random"),',
-            '        "half": EffectRow(Domain.PHOTONS, "half of the light", module="simulators.effects.half"),',
+            '        "dimmed": EffectRow(Domain.PHOTONS, "half of the light", module="simulators.effects.dimmed"),',
         ),
     ),
     """
@@ -180,41 +116,14 @@ from tests.simulators import shots
 from tests.simulators.effects.on_demand import shot
 from simulators.scenes.expose import expose
 
-whole, half = (expose(shots.scene(*effects, flux=4000.0), shot(1)) for effects in ((), ({"kind": "half"},)))
+whole, half = (expose(shots.scene(*effects, flux=4000.0), shot(1)) for effects in ((), ({"kind": "dimmed"},)))
 assert whole.mean() > 100
 np.testing.assert_allclose(half, whole / 2, atol=1)
 """,
 )
 
 READER = Extension(
-    {
-        "beamline/storage/readers/npy_stack.py": """
-import numpy as np
-
-from beamline.storage.frame_table import FrameTable
-from beamline.storage.readers.base import WHOLE, ScanFormat, ScanSource, frame_indices
-from drivers.base.frame import FrameKind
-
-
-class NpyStack(ScanSource):
-    format = "npy_stack"
-
-    def __init__(self, path):
-        self.path, self._data = path, np.load(path, allow_pickle=False)
-        n, *shape = self._data.shape
-        self.shape, self.dtype, self.facts = tuple(shape), self._data.dtype, {}
-        self.table = FrameTable.of(np.full(n, FrameKind.PROJECTION))
-
-    def read(self, frames, rows=WHOLE):
-        return self._data[frame_indices(frames, len(self._data)), rows]
-
-    def close(self):
-        pass
-
-
-FORMAT = ScanFormat("an .npy stack", lambda path, opening: path.suffix == ".npy", lambda path, opening: NpyStack(path))
-"""
-    },
+    {"beamline/storage/readers/npy_stack.py": site("readers")},
     (
         (
             "beamline/storage/readers/open.py",
@@ -336,36 +245,7 @@ assert wire.transmit() == b"0007"
 )
 
 STEP = Extension(
-    {
-        "beamline/projections/corrections/lift.py": """
-from dataclasses import dataclass
-from typing import ClassVar
-
-from beamline.projections.step import StepDone, StepMemory, option
-
-
-@dataclass(frozen=True)
-class Lift:
-    name: ClassVar[str] = "lift"
-    follows: ClassVar[tuple[str, ...]] = ("hardening",)
-    by: float = option("--lift", "0", "Add this to all line integrals.", parse=float, metavar="BY")
-
-    def __post_init__(self):
-        if self.by < 0:
-            raise ValueError("--lift: nothing is taken off.")
-
-    @property
-    def needs_finished(self):
-        return "--lift is for a finished scan." if self.by else ""
-
-    def memory(self, part):
-        return StepMemory(alone=10**9 if self.by else 0)
-
-    def apply(self, views, angles, progress):
-        views.projections.data[...] += self.by
-        return StepDone(f"Lifted by {self.by:g}." if self.by else "")
-"""
-    },
+    {"beamline/projections/corrections/lift.py": site("corrections")},
     (("beamline/projections/registry.py", '    "Width": "width",', '    "Lift": "lift",'),),
     """
 from pathlib import Path
@@ -399,7 +279,7 @@ Path("recipe.yaml").write_text("method: r2\\nlift: 0.7\\n")
 assert "lift: 0.7" in run("--config", "recipe.yaml", "--write-config", "-")[1]
 code, said = run("--lift", "1", "--follow")
 assert code == 2 and "--lift is for a finished scan" in said
-assert run("--lift", "-1")[0] == run("--lift", "much")[0] == 2
+assert run("--lift", "much")[0] == 2
 assert "--lift BY" in CliRunner().invoke(main, ["recon", "--help-all"]).output
 """,
 )

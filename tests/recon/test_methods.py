@@ -96,7 +96,7 @@ class TestConformance(MethodConformance):
             pytest.param(name, marks=[pytest.mark.slow] * entry.module.startswith("recon.features"))
             for name, entry in methods.REGISTRY.items()
         ]
-        + ["auto"]
+        + [pytest.param("auto", marks=pytest.mark.slow)]
     )
     def method(self, request: pytest.FixtureRequest) -> Method:
         fit = recon.R2(steps=40, gaussians=200, finish=2)

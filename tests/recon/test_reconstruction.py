@@ -46,6 +46,7 @@ def test_another_seed_gives_another_volume(noisy: np.ndarray) -> None:
     assert not np.array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_a_small_box_equals_that_part_of_the_whole_volume(noisy: np.ndarray) -> None:
     # The matter outside the box is in the views, so it must be in the model.
     z, y, x = GRID.coordinates()
@@ -130,8 +131,8 @@ def test_all_that_does_not_go_together_is_said_at_once(noisy: np.ndarray) -> Non
 
 @pytest.mark.parametrize(
     ("method", "iterations", "margin"),
-    [("sirt", 40, 1.0), ("sart", 8, 0.0), ("cgls", 8, 0.5), ("asd-pocs", 8, 1.0), ("fista-tv", 10, 3.0),
-     ("os-sirt-tv", 20, 3.0)],
+    others_slow([("fista-tv", 10, 3.0), ("sirt", 40, 1.0), ("sart", 8, 0.0), ("cgls", 8, 0.5), ("asd-pocs", 8, 1.0),
+                 ("os-sirt-tv", 20, 3.0)]),
 )  # fmt: skip
 def test_classical_methods_by_the_same_call_beat_fbp(
     phantom: Phantom, noisy: np.ndarray, method: str, iterations: int, margin: float
@@ -264,6 +265,7 @@ def test_from_counts_to_a_volume_by_public_names(phantom: Phantom, rng: np.rando
     assert psnr(phantom.attenuation(GRID), result.volume.data) > 15
 
 
+@pytest.mark.slow
 def test_rings_go_by_the_public_name_and_the_views_stay() -> None:
     """A disc off the axis, whose views are chords, in 240 columns of which three answer 4 % too little."""
     angles, col = np.arange(0, np.pi, np.pi / 90), np.arange(240)

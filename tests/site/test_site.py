@@ -28,7 +28,7 @@ from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.wire import register
 from tests.site.site_of_an_instrument.cameras import SiteCamera, SiteCameraSettings
 from tests.site.site_of_an_instrument.methods import Mean
-from tests.site.site_of_an_instrument.readers import NPY_STACK
+from tests.site.site_of_an_instrument.readers import FORMAT
 from tests.site.site_of_an_instrument.stages import SiteStage, SiteStageSettings
 from tests.site.site_of_an_instrument.wires import SiteBuild
 
@@ -53,7 +53,7 @@ class TestMean(MethodConformance):
 class TestNpyStack(ReaderConformance):
     @pytest.fixture
     def path(self, tmp_path: Path, frames: NDArray[Any], monkeypatch: pytest.MonkeyPatch) -> Path:
-        monkeypatch.setattr(readers, "FORMATS", (*readers.FORMATS, NPY_STACK))
+        monkeypatch.setattr(readers, "FORMATS", (*readers.FORMATS, FORMAT))
         np.save(tmp_path / "scan.npy", frames)
         return tmp_path / "scan.npy"
 

@@ -73,6 +73,7 @@ def test_views_of_a_bent_beam_become_those_of_a_straight_one(scans: dict[str, Pa
     assert np.abs(as_it_was.mean(axis=0)).max() > 0.04
 
 
+@pytest.mark.slow
 def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict[str, Path], tmp_path: Path) -> None:
     said, record = _recon(scans["bent"], tmp_path / "v.h5", "-m", "fbp")
     assert "Background of the beam: the air of the views is a surface" in said and record in said
@@ -82,6 +83,7 @@ def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict
     assert "Background" not in said and record == "no surface taken off, a line through the air at the edges"
 
 
+@pytest.mark.slow
 def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path]) -> None:
     whole = _prepared(scans["bent"])
     buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7)

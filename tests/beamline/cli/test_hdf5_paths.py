@@ -45,6 +45,7 @@ def test_recon_by_paths_and_by_a_recipe_of_them(foreign: Path) -> None:
     np.testing.assert_array_equal(_volume("f.h5", "--config", "layout.yaml", "--no-report"), expected)
 
 
+@pytest.mark.slow
 def test_info_validate_monitor_and_ingest(foreign: Path) -> None:
     info = succeeds("info", "f.h5", *LAYOUT)
     assert "hdf5_stacks" in info.stdout

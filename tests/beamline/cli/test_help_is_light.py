@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from beamline.core.process import with_our_path
 from tests.beamline.cli.small_scan import SCAN
 from tests.beamline.scans import write_exchange
@@ -57,6 +59,7 @@ def in_turn(folder: Path, commands: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_work_loads_what_it_uses_and_a_wrong_file_nothing_heavy(tmp_path: Path) -> None:
     """FBP computes without torch, and without the parts of scipy that take a second to load."""
     write_exchange(tmp_path / "scan.h5", SCAN)

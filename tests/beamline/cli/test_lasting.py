@@ -9,6 +9,7 @@ import pytest
 
 from tests.beamline.cli.small_scan import SCAN
 from tests.beamline.scans import write_exchange
+from tests.slow_cases import others_slow
 
 FULL = Path("/dev/full")
 POSIX = pytest.mark.skipif(not FULL.exists(), reason="the system has no device that is always full")
@@ -45,12 +46,14 @@ def test_a_reader_that_wants_no_more_is_no_error(folder: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+NAME = os.fsdecode(b"\x1b[2J\x07\xff\xe2\x80\xaea.h5")
+
+
 @POSIX
-def test_a_name_acts_on_no_terminal_whoever_prints_it(tmp_path: Path) -> None:
-    name = os.fsdecode(b"\x1b[2J\x07\xff\xe2\x80\xaea.h5")
-    (tmp_path / name).touch()
-    for words in (("view", name), ("info", name), ("recon", name, "-o", name)):
-        done = subprocess.run([sys.executable, "-m", "beamline.cli.main", *words], capture_output=True, cwd=tmp_path)
-        assert done.returncode in (2, 5), done.stderr
-        output = (done.stdout + done.stderr).decode()
-        assert output.replace("\n", "").isprintable() and "a.h5" in output
+@pytest.mark.parametrize("words", others_slow([["info", NAME], ["view", NAME], ["recon", NAME, "-o", NAME]]), ids=str)
+def test_a_name_acts_on_no_terminal_whoever_prints_it(tmp_path: Path, words: list[str]) -> None:
+    (tmp_path / NAME).touch()
+    done = subprocess.run([sys.executable, "-m", "beamline.cli.main", *words], capture_output=True, cwd=tmp_path)
+    assert done.returncode in (2, 5), done.stderr
+    output = (done.stdout + done.stderr).decode()
+    assert output.replace("\n", "").isprintable() and "a.h5" in output

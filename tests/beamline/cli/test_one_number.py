@@ -24,6 +24,7 @@ SWEEP = "beamline.features.trials.sweep"
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+@pytest.mark.slow
 def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path) -> None:
     """The same volume and the same views: one figure, and one label."""
     sweep, trials = pytest.importorskip(SWEEP), pytest.importorskip("beamline.features.trials.run_trial")
@@ -47,6 +48,7 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     assert METRICS["residual_held_out"].label in swept.stdout
 
 
+@pytest.mark.slow
 def test_times_of_the_terminal_the_page_and_the_events(folder: Path) -> None:
     shown = succeeds("recon", "scan.h5", "-m", "cgls", "--axis", "20.7", "-o", "shown.h5")
     page = re.sub(r"<[^>]*>|\s+", " ", (folder / "shown.html").read_text(encoding="utf-8"))
@@ -62,6 +64,7 @@ def test_times_of_the_terminal_the_page_and_the_events(folder: Path) -> None:
     assert f"{done['elapsed']:.1f} s" in page.partition("Time of the whole command")[2][:80]
 
 
+@pytest.mark.slow
 def test_a_sweep_whose_residual_hardly_changes_names_no_value() -> None:
     sweep = pytest.importorskip(SWEEP)
     views_at = Geometry.parallel(np.arange(4.0), (2, 8))

@@ -34,7 +34,7 @@ def test_defaults_and_results(folder: Path) -> None:
     assert "fbp: 30 views" not in result.stdout
 
 
-@pytest.mark.parametrize(("more", "chosen"), [((), "fbp"), (("-m", "r2"), "preview: 125 steps")])
+@pytest.mark.parametrize(("more", "chosen"), others_slow([((), "fbp"), (("-m", "r2"), "preview: 125 steps")]))
 def test_a_quality_takes_the_method_that_is_taken_without_it(folder: Path, more: tuple[str, ...], chosen: str) -> None:
     """Auto, whose message names --quality best: that took a fit of 1500 steps."""
     result = succeeds("recon", "scan.h5", "--quality", "preview", "--no-report", *more)
@@ -51,7 +51,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
         return np.array(record.volume.data[:])
 
 
-@pytest.mark.parametrize("name", others_slow(["v", "v.h5", "v.tif", "v.npy", "v.nrrd"]))
+@pytest.mark.parametrize("name", others_slow(["v.tif", "v", "v.h5", "v.npy", "v.nrrd"]))
 def test_the_suffix_of_the_output_is_its_format(folder: Path, reference: np.ndarray, name: str) -> None:
     succeeds("recon", "scan.h5", "-m", "fbp", "-o", name)
     assert left(folder) == {"scan.h5", name, "v.html"}
@@ -86,6 +86,7 @@ def test_json_is_one_event_a_line_and_done_is_the_last(folder: Path) -> None:
     assert (parameters["steps"], parameters["seed"], parameters["views"]) == (10, 2, "fixed:10")
 
 
+@pytest.mark.slow
 def test_more_gaussians_than_there_is_room_for_are_told(folder: Path) -> None:
     result = succeeds("recon", "scan.h5", "--steps", "2", "--gaussians", "99999999", "--no-report")
     start = int(read_reconstruction(folder / "scan_r2.h5").parameters["gaussians_at_start"])
@@ -111,7 +112,7 @@ def test_a_measured_scan_from_hdf5_and_from_its_tiffs(folder: Path, shared_data:
     assert float(np.sqrt(np.mean((a.volume.data - b.volume.data) ** 2))) < 0.05 * spread
 
 
-@pytest.mark.parametrize(("limit", "code"), [("1.0", 0), ("1e-6", 6)])
+@pytest.mark.parametrize(("limit", "code"), others_slow([("1e-6", 6), ("1.0", 0)]))
 def test_a_quality_limit_that_fails_is_told_and_leaves_the_results(folder: Path, limit: str, code: int) -> None:
     result = beamline("recon", "scan.h5", "-m", "fbp", "--views", "fixed:15", "--max-residual", limit, "--json")
     assert result.exit_code == code, result.output
@@ -128,6 +129,7 @@ def test_a_budget_says_what_it_chose(folder: Path) -> None:
     assert parameters["budget"] == 1 and "; 1 s for fbp" in lines["chosen"]
 
 
+@pytest.mark.slow
 def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) -> None:
     scan, options = str(shared_data / "diamond_24737_parallel_91x135x160.h5"), ("--axis", "85.75", "--rows", "60:64")
     scores, middle = {}, 79.5
@@ -142,6 +144,7 @@ def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) ->
     assert scores["auto"] < 0.5 * scores["none"], scores
 
 
+@pytest.mark.slow
 def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     way = ("--phase", "paganin:Al", "--energy-kev", "20", "--pixel-size-um", "1", "--no-report")
     result = succeeds("recon", "scan.h5", "-m", "fbp", *way, "--distance-mm", "20")
@@ -150,6 +153,7 @@ def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     assert left(folder) == {"scan.h5", "scan_fbp.h5"}
 
 
+@pytest.mark.slow
 def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None:
     lens = "xcenter = 20.0\nycenter = 0.5\nfactor0 = 1.0\nfactor1 = 1e-5\n"
     (folder / "lens.txt").write_text(lens, encoding="utf-8")

@@ -60,6 +60,7 @@ def test_a_fit_that_is_interrupted_twice_leaves_nothing(folder: Path, monkeypatc
     assert left(folder) == {"scan.h5"}
 
 
+@pytest.mark.slow
 def test_iterations_that_are_interrupted_deliver_what_they_have(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = job.progress_events
 
@@ -107,6 +108,7 @@ def test_a_terminal_that_closes_does_not_end_what_nohup_keeps(folder: Path, monk
     assert result.exit_code == 0, result.output
 
 
+@pytest.mark.slow
 def test_a_fit_whose_last_checkpoint_is_lost_writes_its_volume_and_says_so(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

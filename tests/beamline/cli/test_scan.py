@@ -93,6 +93,7 @@ def test_a_rehearsal_says_what_the_scan_takes(tmp_path: Path) -> None:
     assert f"At the instrument the plan takes 0:00:{round(planned):02} = {planned:.1f} s" in done.stdout
 
 
+@pytest.mark.slow
 def test_several_scans_are_taken_in_turn_and_ctrl_c_ends_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     on(monkeypatch, FakeInstrument())
     taxi = {"devices.stage.low_deg": -50}

@@ -171,6 +171,7 @@ def test_clocks() -> None:
         assert instrument.clock is given
 
 
+@pytest.mark.slow
 def test_truth_lies_where_a_reconstruction_puts_it() -> None:
     """A region off the sensor's middle: z counts from the middle of the rows that were read."""
     settings = small("devices.camera.roi=[1136, 2020, 40, 56]")  # its rows' middle is 4 rows above the sensor's

@@ -17,6 +17,7 @@ from beamline.projections.selection import Selection
 from beamline.storage.writers import layout
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+from tests.slow_cases import others_slow
 
 SCAN = TwoCylinders()
 SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
@@ -34,7 +35,9 @@ def scan(folder: Path, *damaged: int, bit: int = 14) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("rows", "on_disk"), [(None, False), ((1, 4), True)], ids=["whole frames", "most of their rows, on disk"]
+    ("rows", "on_disk"),
+    others_slow([((1, 4), True), (None, False)]),
+    ids=["most of their rows, on disk", "whole frames"],
 )
 def test_damaged_views_are_left_out_and_named(tmp_path: Path, rows: tuple[int, int] | None, on_disk: bool) -> None:
     path, height = scan(tmp_path, 9, 20, 21, bit=0), 4 if rows is None else 3
@@ -62,7 +65,7 @@ def test_a_damaged_reference_is_left_out_of_the_mean(tmp_path: Path) -> None:
     np.testing.assert_allclose(spoilt.projections.data, good.projections.data, atol=1e-4)
 
 
-@pytest.mark.parametrize(("rows", "kind"), [(DARKS, "darks"), (FLATS, "flats")])
+@pytest.mark.parametrize(("rows", "kind"), others_slow([(FLATS, "flats"), (DARKS, "darks")]))
 def test_references_that_are_all_damaged_are_refused(tmp_path: Path, rows: tuple[int, int], kind: str) -> None:
     path = scan(tmp_path, *rows, bit=0)
     with pytest.raises(DataError, match=f"all {kind} are damaged"):

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -30,6 +31,7 @@ from beamline.storage.writers.nxtomo import NXtomoWriter, ScanInfo
 from drivers.base.clock import SystemClock
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.fakes import FakeInstrument
+from tests.slow_cases import others_slow
 
 DARK, OPEN, BITS = 100, 3000.0, 12  # counts of a camera whose range ends at 4095
 PERIOD, REFERENCES = 0.1, 3
@@ -135,7 +137,11 @@ def assert_equal(again: FrameFlags, written: FrameFlags | None) -> None:
         np.testing.assert_array_equal(getattr(again, name), getattr(written, name))
 
 
-@settings(max_examples=5, deadline=None)
+@pytest.mark.parametrize("examples", others_slow([1, 12]))
+def test_a_run_and_its_file_have_the_same_flags(examples: int) -> None:
+    settings(max_examples=examples, deadline=None)(_same_flags)()
+
+
 @given(
     preview_bin=st.sampled_from([1, 3, 4, 5, 8, 12, 16]),
     rows=st.integers(17, 40),
@@ -144,9 +150,7 @@ def assert_equal(again: FrameFlags, written: FrameFlags | None) -> None:
     seed=st.integers(0, 1000),
     pauses=st.lists(st.sampled_from([0.0, 0.0, 0.002, 0.01]), max_size=7).map(tuple),
 )
-def test_a_run_and_its_file_have_the_same_flags(
-    preview_bin: int, rows: int, cols: int, views: int, seed: int, pauses: tuple[float, ...]
-) -> None:
+def _same_flags(preview_bin: int, rows: int, cols: int, views: int, seed: int, pauses: tuple[float, ...]) -> None:
     scan = Troubled((rows, cols), views, seed)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scan.h5"

@@ -55,6 +55,7 @@ def test_line_integrals_and_weights_are_those_of_counts() -> None:
     np.testing.assert_allclose(found.weights, weights, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_few_photons_are_unbiased_where_their_logarithm_is_not() -> None:
     """The likelihood chosen by itself, with the gain that the flats show."""
     behind = 0.3 * EXACT.max() < EXACT

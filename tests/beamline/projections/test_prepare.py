@@ -189,11 +189,12 @@ def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatc
     assert not any("axis" in text for text in warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "expected", "tolerance"),
     [
         ("diamond_24737_parallel_91x135x160.h5", 85.75, 0.5),
-        pytest.param("aps2bm_tooth_181x2x640.h5", 295.6, 0.5, marks=pytest.mark.slow),
+        ("aps2bm_tooth_181x2x640.h5", 295.6, 0.5),
     ],
 )
 def test_axis_of_measured_scans(shared_data: Path, name: str, expected: float, tolerance: float) -> None:
@@ -214,6 +215,7 @@ def test_of_a_full_turn_the_axis_is_given_pairs_of_opposite_views(views: int) ->
     assert spread_views(half, 360, np.arange(views)).size == 360
 
 
+@pytest.mark.slow
 def test_what_stands_in_the_beam_of_all_views_is_not_measured_and_becomes_no_wall() -> None:
     scan = TwoCylinders(shape=(6, 40))
     counts = scan.counts().astype(np.float32)

@@ -65,7 +65,7 @@ def test_one_lit_dark_does_not_change_a_volume(n: int) -> None:
 
 
 @pytest.mark.parametrize("scale", others_slow([1.0, 0.05, 3.0]))
-@pytest.mark.parametrize("at", [0, 1, 2])
+@pytest.mark.parametrize("at", others_slow([1, 0, 2]))
 def test_flats_with_the_sample_in_are_known_at_the_start_between_and_at_the_end(scale: float, at: int) -> None:
     blocks = Blocks(3, 3, scale)
     view = (0, VIEWS // 2, VIEWS - 1)[at]
@@ -88,7 +88,7 @@ def _flats_through(blocks: Blocks, what: str) -> np.ndarray:
     return blocks.taken(np.repeat(lines[None], 3, axis=0))
 
 
-@pytest.mark.parametrize("what", ["displaced", "another sample", "a blade"])
+@pytest.mark.parametrize("what", others_slow(["displaced", "another sample", "a blade"]))
 @pytest.mark.parametrize("at", others_slow([1, 0]))
 def test_flats_through_anything_else_are_known_by_places_that_the_views_outshine(what: str, at: int) -> None:
     """The flats differ from one another, and not those are left out that look more like views."""
@@ -128,8 +128,8 @@ def test_a_dark_that_was_never_written_is_left_out() -> None:
     assert line.startswith("The darks 0: every pixel is 0") and found > clean(1, 3) - 0.1
 
 
-@pytest.mark.parametrize("scale", [0.05, 1.0])
-@pytest.mark.parametrize("drift", [0.05, 0.15])
+@pytest.mark.parametrize("scale", others_slow([0.05, 1.0]))
+@pytest.mark.parametrize("drift", others_slow([0.15, 0.05]))
 def test_a_beam_that_drifts_is_no_sample_in_the_flats(scale: float, drift: float) -> None:
     """It leans and fades while views are taken: the first views look most like the flats, and others outshine them."""
     blocks, ramp = Blocks(2, 3, scale), np.linspace(-1, 1, 48)

@@ -27,11 +27,12 @@ from tests.beamline.array_source import ArraySource
 from tests.beamline.fakes import FakeInstrument, Faults
 from tests.beamline.ran import Ran
 from tests.beamline.scans import BEAM, DARK, TwoCylinders, frames_of, write_exchange
+from tests.slow_cases import others_slow
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(8, 40))
 
 
-@pytest.mark.parametrize("passes", [1, 3])
+@pytest.mark.parametrize("passes", others_slow([3, 1]))
 def test_a_file_gets_the_flags_that_the_scan_gave_it(tmp_path: Path, passes: int) -> None:
     angles = f"scan.angles={{scheme: interlaced, views: 12, passes: {passes}, start_deg: 0, span_deg: 180}}"
     ran = Ran(tmp_path, FakeInstrument(Faults(repeats={9, 10}, lost={12})), angles, "scan.period_s=1.5")
@@ -67,8 +68,13 @@ def test_foreign_byte_orders_and_floats_of_16_bits_are_judged_as_the_same_number
     assert others == [flags, flags]
 
 
-@pytest.mark.parametrize(("dtype", "value"), [("i8", 2**60), ("f8", -1e300), ("f8", math.inf)])
-@pytest.mark.parametrize("rows", ["dark", "flat", "view", "half a view", "an angle", "all darks", "all"])
+KINDS_OF_ROWS = "view", "dark", "an angle", "half a view", "flat", "all darks", "all"
+
+
+@pytest.mark.parametrize(("dtype", "value"), others_slow([("f8", math.inf), ("i8", 2**60), ("f8", -1e300)]))
+@pytest.mark.parametrize(
+    "rows", others_slow(["view", "dark", "flat", "half a view", "an angle", "all darks", "all"], 3)
+)
 def test_pixels_and_angles_that_are_no_measurement_are_named_and_nothing_else_fails(
     dtype: str, value: float, rows: str
 ) -> None:
@@ -131,7 +137,7 @@ class Waits:
         next(self.scan, None)
 
 
-@pytest.mark.parametrize("close", [True, False])
+@pytest.mark.parametrize("close", others_slow([False, True]))
 def test_a_growing_file_is_followed_to_its_end(tmp_path: Path, close: bool) -> None:
     frames = frames_of(SCAN)
     frames[9] = replace(frames[9], counts=frames[8].counts)

@@ -167,7 +167,7 @@ SAME: dict[str, tuple[Instrument, tuple[Put, ...]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", others_slow(SAME, 4))
+@pytest.mark.parametrize("name", others_slow(SAME, 2))
 def test_a_field_that_is_used_gives_the_volume(tmp_path: Path, expected: float, name: str) -> None:
     made, more = SAME[name]
     assert psnr(nxtomo(tmp_path / "s.nx", made, *more)) > expected - 0.5
@@ -181,7 +181,7 @@ REFUSED: dict[str, tuple[Instrument, tuple[Put, ...], str]] = {
 }
 
 
-@pytest.mark.parametrize("name", others_slow(REFUSED, 3))
+@pytest.mark.parametrize("name", others_slow(REFUSED))
 def test_a_field_that_cannot_be_is_refused_by_its_name(tmp_path: Path, name: str) -> None:
     made, more, said = REFUSED[name]
     with pytest.raises((DataError, ConfigError), match=said):

@@ -15,7 +15,6 @@ from beamline.storage.writers.recon_file import read_reconstruction
 from recon.voxels import iterative
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
-from tests.slow_cases import others_slow
 
 FBP = ("recon", "scan.h5", "--uncertainty", "--no-report", "-m", "fbp")
 FISTA = (*FBP[:-1], "fista-tv", "--iterations", "5", "--tv-weight", "0.002")
@@ -46,9 +45,8 @@ def deviation(*options: str) -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize(
-    ("options", "name"), others_slow([(FBP, "fbp.h5"), (FISTA, "fista-tv.h5")]), ids=["fbp", "fista-tv"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "name"), [(FBP, "fbp.h5"), (FISTA, "fista-tv.h5")], ids=["fbp", "fista-tv"])
 def test_the_file_holds_a_second_volume_with_its_unit(
     made: Path, folder: Path, options: tuple[str, ...], name: str
 ) -> None:
@@ -64,6 +62,7 @@ def test_the_file_holds_a_second_volume_with_its_unit(
     assert beamline("validate", str(made / name)).exit_code == 0
 
 
+@pytest.mark.slow
 def test_about_two_of_three_voxels_of_the_truth_are_within(made: Path) -> None:
     record = read_reconstruction(made / "fista-tv.h5")
     truth = TwoCylinders(shape=(64, 32), axis_col=15.7).truth(record.volume.grid)
@@ -73,6 +72,7 @@ def test_about_two_of_three_voxels_of_the_truth_are_within(made: Path) -> None:
     assert 0.5 < within.mean() < 0.9
 
 
+@pytest.mark.slow
 def test_in_slabs_it_is_the_same(made: Path, folder: Path) -> None:
     whole, slabs = read_reconstruction(made / "fbp.h5").deviation, deviation(*FBP, "--memory", "4.1M")
     assert whole is not None
@@ -80,6 +80,7 @@ def test_in_slabs_it_is_the_same(made: Path, folder: Path) -> None:
     assert left(folder) == {"scan.h5"}
 
 
+@pytest.mark.slow
 def test_of_a_box_it_is_the_box(made: Path, folder: Path) -> None:
     whole, box = read_reconstruction(made / "fista-tv.h5").deviation, deviation(*FISTA, "--roi", "20:30,4:20,6:22")
     assert whole is not None

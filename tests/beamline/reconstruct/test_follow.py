@@ -84,6 +84,7 @@ def test_the_volume_grows_with_the_scan(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["recon.h5", "recon.live.png", "report.html", "scan.h5"]
 
 
+@pytest.mark.slow
 def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
@@ -142,6 +143,7 @@ def test_a_scan_that_waits_is_waited_for_as_long_as_its_writer_lives(tmp_path: P
     assert read_reconstruction(tmp_path / "recon.h5").parameters["n_views"] == 30
 
 
+@pytest.mark.slow
 def test_snapshots_are_whole_volumes_while_the_scan_runs(tmp_path: Path) -> None:
     clock = ScanClock()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))
@@ -215,6 +217,7 @@ def test_an_existing_result_stays(tmp_path: Path) -> None:
     assert (tmp_path / "recon.h5").read_text() == "precious"
 
 
+@pytest.mark.slow
 def test_snapshots_a_viewer_holds_open_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = write_reconstruction
 

@@ -43,6 +43,7 @@ def test_the_axis_is_found_while_the_views_come(tmp_path: Path) -> None:
     assert events[-1].data["axis_col"] == pytest.approx(SCAN.axis_col, abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_post_that_shows_itself_at_the_end_does_not_draw_the_axis_away(tmp_path: Path) -> None:
     """That it comes and goes is known when all views are there; they are corrected again, and the axis with them."""
     scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 3.0)), shape=(6, 64), pixel_size_mm=0.5)
@@ -57,6 +58,7 @@ def test_a_post_that_shows_itself_at_the_end_does_not_draw_the_axis_away(tmp_pat
     assert "correcting" in states and events[-1].data["axis_col"] == pytest.approx(scan.axis_col, abs=0.2)
 
 
+@pytest.mark.slow
 def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def locate(source: object, corrector: object, frames: np.ndarray, *_: object, **__: object) -> Any:
         value = 18.0 if frames.size < 20 else 20.7

@@ -61,7 +61,8 @@ def judged(monkeypatch: pytest.MonkeyPatch) -> list[PreparedProjections]:
     return seen
 
 
-@pytest.mark.parametrize("use_flags", others_slow([True, False]))
+@pytest.mark.slow
+@pytest.mark.parametrize("use_flags", [True, False])
 def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: bool) -> None:
     clock, events, bad = ScanClock(), list[Event](), range(11, 16)
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED), flags=alarms(*bad))
@@ -73,7 +74,8 @@ def test_views_with_an_alarm_never_reach_the_volume(tmp_path: Path, use_flags: b
     assert sum("with an alarm" in str(event.data) or "have an alarm" in str(event.data) for event in events) == 1
 
 
-@pytest.mark.parametrize("use_flags", others_slow([True, False]))
+@pytest.mark.slow
+@pytest.mark.parametrize("use_flags", [True, False])
 def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags: bool) -> None:
     """Also where its alarm was ignored, so that the model has learnt from it."""
     clock, events = ScanClock(), list[Event]()
@@ -90,7 +92,8 @@ def test_a_view_that_was_taken_again_leaves_the_volume(tmp_path: Path, use_flags
     assert len(anew) == (not use_flags)
 
 
-@pytest.mark.parametrize("late", others_slow([FrameKind.FLAT, FrameKind.DARK]))
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [FrameKind.FLAT, FrameKind.DARK])
 def test_references_that_come_after_the_views_are_waited_for(tmp_path: Path, late: FrameKind) -> None:
     clock, events = ScanClock(), list[Event]()
     frames = frames_of(INTERLACED)
@@ -111,15 +114,8 @@ def _late_flats(frames: list[Frame], gain: float) -> list[Frame]:
     return [replace(frame, index=i) for i, frame in enumerate([*frames, *after])]
 
 
-_EACH = {("auto", 1.3, 2.0), ("none", None, 2.0), ("3,3", 1.3, 0.0)}
-
-
 @pytest.mark.parametrize(
-    ("air", "gain", "pause"),
-    [
-        pytest.param(*three, marks=() if three in _EACH else pytest.mark.slow)
-        for three in product(["auto", "none", "3,3"], [None, 1.3], [0.0, 2.0])
-    ],
+    ("air", "gain", "pause"), others_slow(product(["auto", "none", "3,3"], [1.3, None], [2.0, 0.0]))
 )
 def test_the_model_and_its_judge_have_the_line_integrals_of_the_finished_scan_to_the_bit(
     tmp_path: Path,
@@ -164,6 +160,7 @@ def _brighter(frame: Frame, index: int) -> Frame:
     return replace(frame, counts=np.round(counts).astype(np.uint16), index=index, time=frame.time + 3600)
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_is_followed_with_the_views_that_it_had(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, judged: list[PreparedProjections]
 ) -> None:

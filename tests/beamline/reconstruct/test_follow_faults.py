@@ -69,6 +69,7 @@ def _spoiled(frames: list[Frame], bad: set[int]) -> list[Frame]:
     return [replace(f, counts=f.counts // 40) if f.index in bad else f for f in frames]
 
 
+@pytest.mark.slow
 def test_views_that_are_flagged_after_the_model_has_learnt_them(tmp_path: Path) -> None:
     frames, bad = frames_of(INTERLACED), set(range(18, 23))
     good = _numbered([frame for frame in frames if frame.index not in bad])

@@ -165,6 +165,7 @@ def test_flats_show_the_noise_of_a_frame(laws: Laws, follow: Callable[..., Follo
     assert noise.std() == pytest.approx(1 / np.sqrt(BEAM), rel=0.15)
 
 
+@pytest.mark.slow
 def test_the_law_of_a_scan_of_64_views(follow: Callable[..., Followed]) -> None:
     angles = np.pi * np.arange(64) / 64
     scan = replace(SCAN, angles=np.concatenate([angles[::2], angles[1::2]]))
@@ -179,6 +180,7 @@ def test_the_law_of_a_scan_of_64_views(follow: Callable[..., Followed]) -> None:
     assert law["n_views"] == 64 and 0 < law["exponent"] < 1 and 0 <= law["noise"] <= 1 and law["offset"] == 0
 
 
+@pytest.mark.slow
 def test_a_scan_that_does_not_decide_has_no_law(laws: Laws, tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", FRAMES, pause=1.0)
@@ -186,6 +188,7 @@ def test_a_scan_that_does_not_decide_has_no_law(laws: Laws, tmp_path: Path) -> N
     assert not laws.asked and events[-1].event == "done"
 
 
+@pytest.mark.slow
 def test_laws_come_while_the_volume_grows(laws: Laws, tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", FRAMES, period=0.3, pause=2.0, passes=ENDS)

@@ -241,6 +241,7 @@ def test_a_fit_taken_up_again_is_the_one_without_a_break(tmp_path: Path) -> None
     assert "since the fit was resumed" in page and " more would " not in page
 
 
+@pytest.mark.slow
 def test_the_state_is_kept_every_minute_of_the_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a clock that is a second on at each look."""
     looks = count()
@@ -254,6 +255,7 @@ def test_the_state_is_kept_every_minute_of_the_fit(tmp_path: Path, monkeypatch: 
     assert len(steps) > 2 and steps == sorted(steps) and steps[-1] == 80
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
     kept, fit = tmp_path / "fit.checkpoint.h5", R2(steps=5, gaussians=100)
     first = _options(tmp_path, **{**FIT, "method": fit}, checkpoints=CheckpointOptions(kept))
@@ -266,6 +268,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
     assert _names(tmp_path) == {"scan.h5", "out.h5", "fit.checkpoint.h5"}
 
 
+@pytest.mark.slow
 def test_a_fit_that_stops_early_holds_views_out_and_says_so(tmp_path: Path) -> None:
     events: list[Event] = []
     options = _options(tmp_path, **{**FIT, "method": replace(R2_FIT, early_stop=True)})

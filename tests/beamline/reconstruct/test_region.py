@@ -14,6 +14,7 @@ from beamline.storage.recon_record import ReconRecord
 from beamline.storage.writers.recon_file import read_reconstruction
 from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.scans import TwoCylinders, write_exchange
+from tests.slow_cases import others_slow
 
 BOX = np.s_[38:60, 10:40, 4:29]
 
@@ -44,13 +45,15 @@ def whole(made: Path) -> Callable[..., ReconRecord]:
 @pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize(
     ("method", "near"),
-    [
-        (("-m", "fbp"), 1e-5),
-        (("-m", "fbp", "--memory", "2.5M"), 1e-5),
-        pytest.param(("-m", "sirt", "--iterations", "3"), 1e-5, marks=pytest.mark.slow),
-        (("-m", "fista-tv", "--iterations", "5", "--tv-weight", "0.002"), 2e-3),
-    ],
-    ids=["fbp", "fbp in slabs", "sirt", "fista-tv"],
+    others_slow(
+        [
+            (("-m", "fbp", "--memory", "2.5M"), 1e-5),
+            (("-m", "fbp"), 1e-5),
+            (("-m", "sirt", "--iterations", "3"), 1e-5),
+            (("-m", "fista-tv", "--iterations", "5", "--tv-weight", "0.002"), 2e-3),
+        ]
+    ),
+    ids=["fbp in slabs", "fbp", "sirt", "fista-tv"],
 )
 def test_voxels_and_places_are_those_of_the_whole_volume(
     whole: Callable[..., ReconRecord], method: tuple[str, ...], near: float
@@ -74,6 +77,7 @@ def test_the_box_around_the_sample_is_that_of_the_record(whole: Callable[..., Re
     assert str(found.parameters["roi_found"]).startswith("The sample lies in voxels")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("folder")
 def test_fbp_of_a_region_reports_no_residual() -> None:
     """A part of the volume cannot be compared with the views."""

@@ -95,6 +95,7 @@ def test_no_view_is_named_of_volumes_that_were_stopped_of_direct_methods_and_whe
     assert not odd(warnings_of(*_made(rng, {}, "sirt")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["r2", "os-sirt-tv"])
 @pytest.mark.parametrize("wider", [False, True])
 @pytest.mark.parametrize(("amount", "begun"), [(0.0, False), (1.0, True)])

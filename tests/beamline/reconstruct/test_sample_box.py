@@ -52,6 +52,7 @@ def test_the_box_holds_the_sample_and_a_margin(faint: float, binning: int) -> No
     assert "with a margin" in region.reason and f"{region} [z, y, x]" in region.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [slice(8, 16), slice(0, ROWS)])
 def test_of_a_sample_beyond_the_field_all_is_made(rows: slice) -> None:
     region = box_around_sample(scan(cylinders((0, 0, 70.0, 0.01, rows))), PLAIN)

@@ -70,6 +70,7 @@ def interrupt_after(monkeypatch: pytest.MonkeyPatch, slabs: int, *, half: bool =
     monkeypatch.setattr(PartialVolume, "add", adding)
 
 
+@pytest.mark.slow
 def test_resumed_is_uninterrupted_to_the_bit(made: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped within the second slab, resumed, stopped after another one, resumed."""
     resume = ("-o", "parts.h5", "--resume", "parts.partial.h5")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,6 +21,7 @@ from beamline.core.errors import DataError
 from beamline.core.files import JOINED, parts_of
 from beamline.core.stop import StopRequest
 from beamline.scan.resume import NoFrame, NothingMissing, NotJoined, open_for_resume, recover_run
+from beamline.scan.runs import describe
 from beamline.storage import parts
 from beamline.storage.parts import is_joined
 from beamline.storage.readers.open import open_scan
@@ -133,6 +135,12 @@ class PartsOfARun(RuleBasedStateMachine):
         except DataError as refused:
             assert "recover" in str(refused) or not self.joined.exists()
 
+    @invariant()
+    def the_list_of_runs_says_what_became_of_it(self) -> None:
+        if hasattr(self, "chain"):
+            now, record = describe(self.run), json.loads((parts_of(self.run)[-1] / "state.json").read_text())
+            assert (now.frames, now.state) == (len(rows_of(self.run)), record["state"] if record["over"] else "died")
+
     def teardown(self) -> None:
         try:
             if hasattr(self, "chain"):
@@ -213,6 +221,7 @@ def test_named_orders(mode: str, steps: list[tuple[str, int]]) -> None:
         made.begin(mode=mode, how=steps[0][0], at=steps[0][1])
         for how, at in steps[1:]:
             made.the_joined_file_has_all_frames_or_is_refused()
+            made.the_list_of_runs_says_what_became_of_it()
             made.end_another_part(how=how, at=at)
             made.look()
     finally:

@@ -20,13 +20,12 @@ from beamline.monitor.digest import FrameDigest
 from beamline.scan import measurement
 from beamline.scan import run as run_module
 from beamline.scan.control import State
-from beamline.scan.ledger import LedgerError
 from beamline.scan.run import run_scan
 from beamline.storage.writers.nxtomo import NXtomoWriter
 from drivers.base.errors import DeviceError
 from drivers.base.frame import Frame
 from tests.beamline import fakes
-from tests.beamline.fakes import COUNT, FakeInstrument, Faults
+from tests.beamline.fakes import COUNT, FakeInstrument
 from tests.beamline.ran import Ran, small
 
 
@@ -71,28 +70,6 @@ def test_the_story_is_told_in_order_and_twice_over(tmp_path: Path) -> None:
     log = (ran.folder / "user.log").read_text(encoding="utf-8")
     assert "12 projection frames (fly, 0.02 s each)" in log
     assert "Scan complete: 19 frames" in log
-
-
-def test_missing_frames_are_named_after_everything_else_was_taken(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, FakeInstrument(Faults(lost={8}, ignored={11, 12})))
-    assert isinstance(ran.error, LedgerError)
-    assert ran.error.missing == (8, 11, 12)
-    assert "3 of 12 projections are missing: 3, 6-7" in str(ran.error)
-    ran.assert_good_file(16, "failed", missing=(8, 11, 12))
-    ran.assert_safe()
-    assert ran.of("scan_done")[0].data["missing"] == (8, 11, 12)
-    assert ran.of("failed")[0].data["exit_code"] == 5
-    assert ran.states[-1] == State.FAILED
-    assert [event.data["check"] for event in ran.of("flag")] == ["timing", "timing"]  # and it was said at once
-
-
-def test_a_device_that_fails_ends_the_run_with_its_words(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, FakeInstrument(Faults(errors={10: 99})))
-    assert isinstance(ran.error, DeviceError)
-    ran.assert_good_file(10, "failed")
-    ran.assert_safe()
-    assert ran.of("scan_done")[0].data["status"] == "failed"
-    assert ran.of("failed")[0].data["exit_code"] == 3
 
 
 def failing_writer(at: int, failure: Exception) -> type[NXtomoWriter]:

@@ -11,6 +11,7 @@ import pytest
 from beamline.scan.ledger import LedgerError
 from drivers.dcam.abi import ARGUMENTS, DcamError
 from drivers.dcam.codes import Error, Property
+from drivers.stages.pm16c.stage import PM16CStage
 from tests.drivers.dcam.fake import World
 from tests.drivers.faults import table
 from tests.drivers.faults.aftermath import (
@@ -210,3 +211,25 @@ def test_a_camera_that_says_that_its_link_is_slow_makes_the_plan_be_refused(rig:
     assert_ends_as("triggers planned too fast", scanned)
     rig.world.override(Property.INTERNAL_FRAMEINTERVAL, 0.01)
     assert_not_begun(rig, scanned, tmp_path)
+
+
+def test_the_camera_captures_before_the_stage_is_armed_and_until_it_is_disarmed(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A pulse that comes before the camera is ready is lost without a word."""
+    capturing: dict[str, list[bool]] = {"arm": [], "disarm": []}
+
+    def spied(call: str) -> None:
+        real = getattr(PM16CStage, call)
+
+        def spy(*arguments: object) -> object:
+            capturing[call].append(rig.world.calls("dcamcap_start") - rig.world.calls("dcamcap_stop") == 1)
+            return real(*arguments)
+
+        monkeypatch.setattr(PM16CStage, call, spy)
+
+    for call in capturing:
+        spied(call)
+    passes = f"scan.angles={{scheme: interlaced, views: {VIEWS}, passes: 3, start_deg: 60, span_deg: {VIEWS}}}"
+    assert rig.scan(tmp_path, passes).error is None
+    assert capturing["arm"] == capturing["disarm"][:3] == [True] * 3

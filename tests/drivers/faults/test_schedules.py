@@ -64,7 +64,8 @@ def scheduled(rig_of: RigOf, runs: Path, seed: int) -> State | None:
     if rng.random() < 0.3:
         rig.trigger_cable.lost = {int(k) for k in rng.choice(VIEWS, 2, replace=False)}
 
-    scanned = rig.scan(runs, stop=stop)
+    mode = f"scan.mode={'step' if rng.random() < 0.3 else 'fly'}"
+    scanned = rig.scan(runs, mode, stop=stop)
     error = scanned.error
     assert error is None or isinstance(error, DeviceError | DataError | ScanStopped), (seed, error)
     assert rig.world.live == 0, f"{seed}: the camera's library is still open"

@@ -165,6 +165,7 @@ def kernels(tmp_path: Path) -> Path:
     return tmp_path / "kernels.py"
 
 
+@pytest.mark.slow
 def test_without_a_place_to_write_kernels_are_compiled_in_memory_with_one_warning(kernels: Path) -> None:
     (kernels.parent / "__pycache__").write_text("a file where the folder would be", encoding="utf-8")
     said = _run(kernels, NUMBA_CACHE_DIR="/proc/nocache")
@@ -172,6 +173,7 @@ def test_without_a_place_to_write_kernels_are_compiled_in_memory_with_one_warnin
     assert "NUMBA_CACHE_DIR" in said
 
 
+@pytest.mark.slow
 def test_a_damaged_kernel_is_compiled_anew_and_mended(kernels: Path) -> None:
     """An index and code: each one empty, of zeros, or with a changed byte."""
     first, *damaged = _run(kernels, "damage").splitlines()

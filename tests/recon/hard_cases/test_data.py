@@ -26,7 +26,7 @@ from recon.splatting.r2 import R2
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project
 from recon.voxels.fbp import fbp
-from tests.recon.hard_cases import spheres
+from tests.recon.bodies import Bodies
 from tests.recon.helpers import run_steps
 from tests.slow_cases import others_slow
 
@@ -35,16 +35,20 @@ SHAPE = (12, 48)
 VIEWS = Geometry.parallel(np.linspace(0, math.pi, 32, endpoint=False), SHAPE)
 GRID = Grid.matching(VIEWS)
 SHORT = FitSettings(policy=None, tv_size=12)
+_AT = np.array([(0.0, 0.0, 0.0), (-7.0, 5.0, 1.0), (8.0, -6.0, -1.0), (6.0, 8.0, 0.5), (-3.0, -10.0, 0.0)])
+_RADII = np.array([19.0, 6.0, 4.0, 3.0, 2.0])
+SPHERES = Bodies(_AT, np.eye(3) / _RADII[:, None, None], np.array([0.02, 0.03, 0.05, -0.02, 0.06]))
+"""With sharp edges, which Gaussians cannot represent exactly; in units of a detector of 48 columns and 12 rows."""
 
 
 @pytest.fixture(scope="module")
 def clean() -> F32:
-    return spheres.projections(VIEWS)
+    return SPHERES.views(VIEWS)
 
 
 @pytest.fixture(scope="module")
 def truth() -> F32:
-    return spheres.volume(GRID)
+    return SPHERES.volume(GRID)
 
 
 def fitted(
@@ -89,6 +93,7 @@ def test_constant_projections_leave_all_finite_and_are_explained_where_they_can_
     assert np.isfinite(fbp(np.ones((32, *SHAPE), np.float32), VIEWS, GRID)).all()
 
 
+@pytest.mark.slow
 def test_counts_of_zero_and_saturated_ones_become_line_integrals_that_fit(clean: F32, truth: F32) -> None:
     rng = np.random.default_rng(1)
     good = rng.poisson(20_000 * np.exp(-clean)) + 100
@@ -125,7 +130,7 @@ def of_all_but_one(clean: F32) -> F32:
         return fitted(without, steps=60, finish=0).volume.data
 
 
-@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3], 2))
+@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3]))
 def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, of_all_but_one: F32, value: float) -> None:
     # It may have no part in where the first Gaussians are placed, nor in how dense they are.
     wild = clean.copy()
@@ -157,6 +162,7 @@ def test_one_view_is_refused_by_name_but_no_step_breaks_on_it(clean: F32) -> Non
     assert float(state.residual) < 0.5
 
 
+@pytest.mark.slow
 def test_equal_angles_count_as_one_place(clean: F32, truth: F32) -> None:
     with pytest.raises(ValueError, match="2 views from one side"):
         reconstruct(clean[[0, 0]], VIEWS.select([0, 0]))
@@ -169,7 +175,7 @@ def test_equal_angles_count_as_one_place(clean: F32, truth: F32) -> None:
 @given(st.permutations(range(32)), st.lists(st.integers(-40, 40), min_size=32, max_size=32))
 @settings(max_examples=10)
 def test_order_and_whole_turns_of_the_angles_do_not_matter(order: list[int], turns: list[int]) -> None:
-    data = spheres.projections(VIEWS)
+    data = SPHERES.views(VIEWS)
     angles = VIEWS.angles[order] + 2 * math.pi * np.array(turns)
     odd = Geometry.parallel(angles, SHAPE)
     np.testing.assert_allclose(fbp(data[order], odd, GRID), fbp(data, VIEWS, GRID), atol=1e-6)
@@ -180,13 +186,13 @@ def test_order_and_whole_turns_of_the_angles_do_not_matter(order: list[int], tur
 @pytest.mark.parametrize("shape", [(1, 48), (12, 1), (1, 1), (2, 17), (1, 300)])
 def test_detectors_of_one_row_or_one_column(shape: tuple[int, int]) -> None:
     views = Geometry.parallel(VIEWS.angles, shape, axis_col=(shape[1] - 1) / 2)
-    data = spheres.projections(views)
+    data = SPHERES.views(views)
     problem = fit.problem_of(Views(data, views), Grid.matching(views), 0.05, SHORT)
     state = run_steps(fit.init(a_few(), 0), problem, SHORT, 60)
     assert all(np.isfinite(values).all() for values in state.parameters.values())
     if shape == (1, 48):
         grid = Grid.matching(views)
-        assert psnr(spheres.volume(grid), fitted(data, views).volume.data) > 25
+        assert psnr(SPHERES.volume(grid), fitted(data, views).volume.data) > 25
 
 
 def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
@@ -217,6 +223,7 @@ def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
     assert varied[1] < 0.7 * varied[0]
 
 
+@pytest.mark.slow
 def test_photon_starved_views_give_a_volume_and_a_better_one_than_fbp(clean: F32, truth: F32) -> None:
     # With three photons a pixel, some count none at all: their line integral is -log(floor), and finite.
     rng, photons = np.random.default_rng(6), 3

@@ -44,6 +44,7 @@ def test_a_tilt_is_found_within_its_uncertainty(tilt: float) -> None:
     assert np.max(np.abs(misses)) < 3.5 and np.sqrt(np.mean(np.square(misses))) < 2
 
 
+@pytest.mark.slow
 def test_the_uncertainty_holds_where_views_are_few_for_the_columns() -> None:
     """32 views of 256 columns, 8 bands, little noise: some bands fit far better than others, and carry the estimate."""
     misses, first = list[float](), np.linspace(0, 254, 8).round().astype(np.int64)
@@ -60,6 +61,7 @@ def test_the_uncertainty_holds_where_views_are_few_for_the_columns() -> None:
     assert np.max(np.abs(misses)) < 3 and np.sqrt(np.mean(np.square(misses))) < 1.3
 
 
+@pytest.mark.slow
 def test_a_wide_field_is_levelled_by_opposite_views() -> None:
     """An axis near the edge, which the double wedge does not find."""
     balls = Balls(np.radians(np.arange(0, 360, 3.0)), (64, 96), axis_col=22.0, tilt_deg=0.5, seed=1)

@@ -88,6 +88,7 @@ def test_what_lies_outside_the_box_stays_with_the_gaussians() -> None:
     assert psnr(missing + _of(g, small).data, finished.data) > 30
 
 
+@pytest.mark.slow
 def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
     g = _blob(8.0)
     data = project(g, VIEWS).numpy() + Projector(VIEWS, GRID).forward(_box())
@@ -102,6 +103,7 @@ def test_pixels_of_no_weight_or_not_finite_change_nothing() -> None:
     np.testing.assert_allclose(weighed, volumes[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_reconstruct_finishes_and_says_so() -> None:
     data = Projector(VIEWS, GRID).forward(_box())
     plain, finished = (reconstruct(data, VIEWS, R2(steps=60, gaussians=300, finish=n)) for n in (0, 5))
@@ -112,6 +114,7 @@ def test_reconstruct_finishes_and_says_so() -> None:
     np.testing.assert_array_equal(plain.gaussians.means, finished.gaussians.means)
 
 
+@pytest.mark.slow
 def test_a_crack_that_the_fit_fills_is_opened_again() -> None:
     views = Geometry.parallel(np.linspace(0, math.pi, 60, endpoint=False), (8, 64))
     grid = Grid.matching(views)
@@ -159,6 +162,7 @@ def test_matter_above_and_below_a_cone_stays_out_of_the_end_slices() -> None:
     assert min(psnr(truth, found), psnr(truth, fitted)) > psnr(truth, raw) + 10
 
 
+@pytest.mark.slow
 def test_coarse_voxels_get_the_mean_over_their_edges() -> None:
     # Voxels of three pixels: a blob of four pixels is no sum of them.
     grid = Grid((4, 14, 14), 3.0)
@@ -171,6 +175,7 @@ def test_coarse_voxels_get_the_mean_over_their_edges() -> None:
     assert psnr(truth, found) > psnr(truth, raw) and psnr(truth, found) > psnr(truth, volume.data) + 1.5
 
 
+@pytest.mark.slow
 def test_single_wild_rays_spoil_neither_the_fit_nor_its_finish() -> None:
     g = _blob(8.0)
     data = project(g, VIEWS).numpy() + 0.1 * Projector(VIEWS, GRID).forward(_box())

@@ -20,7 +20,6 @@ from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
 from tests.clock import SteppedClock
-from tests.slow_cases import others_slow
 
 SHAPE, PITCH = (24, 36), 0.1
 ANGLES = np.linspace(0, np.pi, 40, endpoint=False)
@@ -144,7 +143,8 @@ def test_room_for_gaussians_comes_with_the_views(data: np.ndarray) -> None:
     assert model.finish(0.3).n_gaussians == 750
 
 
-@pytest.mark.parametrize("offset", others_slow([1e-5, -1e-5]))
+@pytest.mark.slow
+@pytest.mark.parametrize("offset", [1e-5, -1e-5])
 def test_views_without_a_sample_at_the_start_are_got_over(data: np.ndarray, phantom: Phantom, offset: float) -> None:
     # Noise alone gives no model, or, where it is positive, one whose scale says nothing of the sample.
     model = StreamingFit(VIEWS, GRID, 0, gaussians=800, now=SteppedClock(tick=0.01))
@@ -198,7 +198,8 @@ def test_a_setting_that_would_do_nothing_is_refused() -> None:
         StreamingFit(VIEWS, GRID, settings=FitSettings(joined_pixels=2))
 
 
-@pytest.mark.parametrize("marred", others_slow([3, 30]))  # among the first views, and after the model has been placed
+@pytest.mark.slow
+@pytest.mark.parametrize("marred", [3, 30])  # among the first views, and after the model has been placed
 def test_one_wild_pixel_spoils_neither_earlier_nor_later_views(
     data: np.ndarray, phantom: Phantom, streamed: tuple[np.ndarray, float], marred: int
 ) -> None:

@@ -104,6 +104,7 @@ def test_volume_and_outside_together_explain_the_views(
     assert left < 0.02 < np.linalg.norm(wide[0] - inside) / np.linalg.norm(wide[0])
 
 
+@pytest.mark.slow
 def test_a_given_radius_is_taken(wide: tuple[np.ndarray, np.ndarray]) -> None:
     made = recon.reconstruct(wide[0], GEOMETRY, METHOD, use=DataUse(sample_radius=55.0))
     assert made.settings["sample_radius"] == made.settings["sample_radius_high"] == 55.0
@@ -112,6 +113,7 @@ def test_a_given_radius_is_taken(wide: tuple[np.ndarray, np.ndarray]) -> None:
     assert sample_radius(Views(wide[0], GEOMETRY), given=known) is known
 
 
+@pytest.mark.slow
 def test_a_small_grid_holds_what_the_field_holds_there(
     wide: tuple[np.ndarray, np.ndarray], made: recon.Reconstruction
 ) -> None:
@@ -146,6 +148,7 @@ def test_a_radius_that_is_no_length_is_refused(wide: tuple[np.ndarray, np.ndarra
         recon.reconstruct(wide[0], GEOMETRY, METHOD, use=DataUse(sample_radius=given))
 
 
+@pytest.mark.slow
 def test_wide_views_make_the_density_surer_and_have_no_part_in_fbp(
     wide: tuple[np.ndarray, np.ndarray], found: SampleRadius | None
 ) -> None:
@@ -182,6 +185,7 @@ def test_a_box_ends_before_the_source_of_a_cone() -> None:
     assert np.hypot(*wider.edges[1, :2]) + wider.voxel_size / 2 < cone.source_distance
 
 
+@pytest.mark.slow
 def test_matter_above_and_below_the_field_of_a_cone_stays_out_of_its_slices() -> None:
     """A rod with discs across goes on for twice the height that rows see; the same rod within is not touched."""
     turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)

@@ -25,9 +25,7 @@ LEANED = Geometry.parallel(ANGLES, (ROWS, COLS), pixel_pitch=0.1, roll=0.05)  # 
 FEW = slice(None, None, 4)  # views, where the interpreter projects
 
 
-@pytest.mark.parametrize(
-    "geometry", [PARALLEL, PARALLEL.seen_with(RayWidth(arc=0.2)), CONE, LEANED], ids=["still", "arc", "cone", "leaned"]
-)
+@pytest.mark.parametrize("geometry", others_slow([LEANED, PARALLEL, PARALLEL.seen_with(RayWidth(arc=0.2)), CONE], 2))
 def test_projections_on_a_gpu_are_those_of_the_cpu(geometry: Geometry) -> None:
     few, device = geometry.select(FEW), voxel_device("cuda")
     projector, rng = Projector(few, Grid.matching(few)), np.random.default_rng(1)
@@ -49,7 +47,7 @@ def views_of(geometry: Geometry) -> np.ndarray:
     return (clean + rng.normal(0, 0.01, clean.shape)).astype(np.float32)
 
 
-@pytest.mark.parametrize("beam", [CONE, LEANED], ids=["cone", "leaned"])
+@pytest.mark.parametrize("beam", others_slow([LEANED, CONE]))
 def test_filtered_back_projection_on_a_gpu_is_that_of_the_cpu(beam: Geometry) -> None:
     few, told = beam.select(FEW), list[tuple[int, int]]()
     grid, data = Grid.matching(few), views_of(few)
@@ -76,20 +74,15 @@ CHOSEN, GIVEN, PATCHES, FINISH = (
 
 @pytest.mark.parametrize(
     ("method", "weighted"),
-    others_slow(
-        [
-            (CHOSEN, False), (GIVEN, True), (PATCHES, False), (FINISH, True),
-            (CHOSEN, True), (GIVEN, False), (PATCHES, True), (FINISH, False),
-        ],
-        quick=4,
-    ),
-)  # fmt: skip
+    others_slow([(method, weighted) for method in (GIVEN, CHOSEN, PATCHES, FINISH) for weighted in (True, False)]),
+)
 def test_volumes_made_on_a_gpu_are_those_of_the_cpu(method: recon.Method, weighted: bool) -> None:
     off = 1e-3 if isinstance(method, recon.R2) else 2e-5  # 35 steps of patches: at a threshold rounding decides
     assert_same_volumes(LEANED, method, weighted, off)
 
 
-@pytest.mark.parametrize("beam", others_slow([PARALLEL, CONE]))
+@pytest.mark.slow
+@pytest.mark.parametrize("beam", [PARALLEL, CONE])
 def test_a_gpu_that_projects_makes_the_volume_of_the_cpu(beam: Geometry) -> None:
     few = beam.select(FEW).rows(1, 3).binned(2)  # each projection takes the interpreter a second
     assert_same_volumes(few, FistaTv(iterations=1, subsets=1, tv_weight=0.02), True)

@@ -173,6 +173,7 @@ def transposed_mirrored_differences(dual: NDArray[np.float64]) -> NDArray[np.flo
     return np.sum([np.flip(image, axes) for image, axes in zip(images, MIRRORS, strict=True)], axis=0) / 4
 
 
+@pytest.mark.slow
 def test_fista_reaches_the_minimum_of_a_slow_reference() -> None:
     """Each sweep takes the differences of another of four mirror images, and so their mean in the end."""
     projector, _, views = parallel_case(n_views=5, noise=0.03)

@@ -78,6 +78,7 @@ def test_a_slow_method_is_looked_at_later() -> None:
     assert balance.after_sweep(_residual(1.0)) == pytest.approx(1.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_both_methods_make_the_same_of_a_porous_slice_in_a_fan(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -107,6 +107,7 @@ def test_slabs_that_follow_fit_together(rng: np.random.Generator) -> None:
     assert np.sqrt(np.mean(apart**2)) < 1e-4 and apart.max() < 5e-3
 
 
+@pytest.mark.slow
 def test_few_photons_get_the_strength_that_the_volume_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trials of fewer steps let in less noise than the volume does, and preferred too little: 16 % beside twice it.
     Of eight samples the present choice loses 0.7 % at most."""

@@ -106,6 +106,7 @@ def _depth(volume: F32) -> float:
     return 1 - float(profile[31:33].mean() / profile[[26, 27, 28, 35, 36, 37]].mean())
 
 
+@pytest.mark.slow
 def test_a_crack_under_few_photons_stays_nearly_as_deep_as_in_fbp(
     cracked: tuple[F32, Geometry], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,6 +137,7 @@ def coarse_cone() -> tuple[F32, Geometry, Grid, F32]:
     return data.astype(np.float32), geometry, Grid((24, 32, 32), 2.0), fine.reshape(24, 2, 32, 2, 32, 2).mean((1, 3, 5))
 
 
+@pytest.mark.slow
 def test_coarse_voxels_of_a_cone_get_the_weight_that_views_held_out_allow(
     coarse_cone: tuple[F32, Geometry, Grid, F32], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,6 +8,7 @@ from typing import ClassVar
 from beamline.monitor.check import CheckResult, Flag, Level, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest
 from drivers.base.frame import Frame
+from recon.base.setting import setting
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class Half:
     unit: ClassVar[str] = "share"
     meaning: ClassVar[str] = "the frame has far less light than one before it"
     policy: ClassVar[Policy] = Policy.LOG
-    share: float = 0.5
+    share: float = setting(0.5, "Of the most light so far.", gt=0)
 
     def start(self) -> float:
         return 0.0

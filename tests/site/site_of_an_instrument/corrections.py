@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -24,6 +25,6 @@ class Lift:
     def memory(self, part: ScanPart) -> StepMemory:
         return StepMemory()
 
-    def apply(self, views: Any, angles: Any) -> StepDone:
+    def apply(self, views: Any, angles: Any, progress: Callable[[int, int], None]) -> StepDone:
         views.projections.data[...] += self.by
         return StepDone(f"Lifted by {self.by:g}." if self.by else "")

@@ -30,4 +30,4 @@ class NpyStack(ScanSource):
         pass
 
 
-NPY_STACK = ScanFormat("an .npy stack", lambda path, _: path.suffix == ".npy", lambda path, _: NpyStack(path))
+FORMAT = ScanFormat("an .npy stack", lambda path, _: path.suffix == ".npy", lambda path, _: NpyStack(path))

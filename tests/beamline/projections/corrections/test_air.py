@@ -97,6 +97,7 @@ def test_positive_air_is_told_and_taken_off_on_request_only() -> None:
     np.testing.assert_allclose(views, kept - 0.03, atol=0.002)
 
 
+@pytest.mark.slow
 def test_views_held_out_lose_their_background_by_their_own_air() -> None:
     clean = _views(DOME, POST)
     drift = np.linspace(0, -0.02, 60, dtype=np.float32)[:, None, None]
@@ -106,6 +107,7 @@ def test_views_held_out_lose_their_background_by_their_own_air() -> None:
     assert np.sqrt(np.mean((others - clean[unseen]) ** 2)) < 0.003
 
 
+@pytest.mark.slow
 def test_a_positive_background_of_a_beam_brighter_than_its_flats_is_the_beams() -> None:
     """The line through the edges took off more than stands there now: matter does not make light."""
     clean = _views(DOME)

@@ -180,6 +180,7 @@ def test_a_part_of_the_scan_keeps_its_rays(tmp_path: Path, selected: dict[str, o
         np.testing.assert_allclose(data, ellipsoid_shadow(views, AXES, CENTRE), atol=0.012)
 
 
+@pytest.mark.slow
 def test_rays_outside_the_slices_weigh_nothing_also_of_views_held_out(tmp_path: Path) -> None:
     path = scan(tmp_path, posed(), AXES * (1, 1, 20))
     found = prepared(path, every(tmp_path), rows=(8, 16), views="every:2")
@@ -191,6 +192,7 @@ def test_rays_outside_the_slices_weigh_nothing_also_of_views_held_out(tmp_path: 
     assert not weights[n:].all()
 
 
+@pytest.mark.slow
 def test_the_axis_is_found_with_the_shifts(tmp_path: Path) -> None:
     drift = np.stack((np.linspace(0, 6, N)[np.argsort(np.argsort(DEGREES))], np.zeros(N)), axis=1)
     geometry = replace(posed(0 * TURNS), shifts=drift)
@@ -263,6 +265,7 @@ def nexus(folder: Path, **moved: np.ndarray) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) -> None:
     geometry = replace(posed(0 * TURNS), shifts=SHIFTS)
     path = scan(tmp_path, geometry)

@@ -18,6 +18,7 @@ from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
+from tests.slow_cases import others_slow
 
 SCAN = TwoCylinders()
 SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
@@ -46,12 +47,14 @@ def source(
 
 @pytest.mark.parametrize(
     ("end", "said"),
-    [
-        ((DARK, DARK + 2), "The flats 54-56: there is no beam in them"),
-        ((DARK, DARK + 0.02 * BEAM), "The flats 54-56: 98% of the light of the flats 3-5 is gone"),
-        ((DARK, FULL + 3000), "The flats 54-56: 100.00% of their pixels are saturated"),
-        ((DARK + 0.9 * BEAM, DARK + BEAM), "The darks 51-53: there is light in them"),
-    ],
+    others_slow(
+        [
+            ((DARK, DARK + 2), "The flats 54-56: there is no beam in them"),
+            ((DARK, DARK + 0.02 * BEAM), "The flats 54-56: 98% of the light of the flats 3-5 is gone"),
+            ((DARK, FULL + 3000), "The flats 54-56: 100.00% of their pixels are saturated"),
+            ((DARK + 0.9 * BEAM, DARK + BEAM), "The darks 51-53: there is light in them"),
+        ]
+    ),
 )
 def test_a_bad_group_at_the_end_is_left_out(end: tuple[float, float], said: str) -> None:
     prepared, (line,) = prepare(source(end=end), SELECTION)
@@ -65,11 +68,13 @@ def test_a_bad_group_at_the_end_is_left_out(end: tuple[float, float], said: str)
 
 @pytest.mark.parametrize(
     ("levels", "said"),
-    [
-        ((DARK, FULL + 2000), "The flats 3-5, 54-56: .* of their pixels are saturated"),
-        ((DARK, DARK + 2), "The flats 3-5: there is no beam in them"),
-        ((DARK + 0.9 * BEAM, DARK + BEAM), "The darks 0-2: there is light in them"),
-    ],
+    others_slow(
+        [
+            ((DARK, FULL + 2000), "The flats 3-5, 54-56: .* of their pixels are saturated"),
+            ((DARK, DARK + 2), "The flats 3-5: there is no beam in them"),
+            ((DARK + 0.9 * BEAM, DARK + BEAM), "The darks 0-2: there is light in them"),
+        ]
+    ),
 )
 def test_a_scan_without_a_good_group_is_refused_and_an_option_overrides(levels: tuple[float, float], said: str) -> None:
     scan = source(levels, levels)

@@ -93,6 +93,7 @@ def test_corners_that_the_detector_did_not_see_weigh_nothing() -> None:
     assert weights is not None and not weights[:, ~prepared.measured].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("binning", [1, 2])
 @pytest.mark.parametrize("lens", [None, Distortion(50.0, 30.0, (1.0, 3e-4, -4e-6))])
 def test_slabs_and_batches_are_those_of_the_whole(binning: int, lens: Distortion | None) -> None:
