@@ -24,14 +24,11 @@ if TYPE_CHECKING:
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
 
-LARGEST = 0.5  # pixels looked at: a shorter way is none
 LEAST = 6  # views on a side that say whether the sample jumped there
 ALIKE = 1.5  # times the deviation of the longest part's views: a part that fits has no more
-_HELPS = 0.005  # share of the deviation that a jump takes away, or a part may add
-_LEVELS = ((64, 2), (128, 4))  # columns, at most, and volumes of all views
-_ROWS, _VIEWS = 16, 360  # binned rows and views looked at, at most; parts of `_SHORT` views have all
+_ADDS = 0.005  # share of the deviation of the longest part's views that a part which fits may add
+_COLS, _ROWS, _VIEWS = 128, 16, 360  # binned pixels and views looked at, at most; parts of `_SHORT` views have all
 _SHORT = 40
-_COPIES = 28  # float32 copies of the views looked at
 _REPAIRED = "`--jumps ignore --calibrate shifts` takes all views, and learns where each stood."
 
 
@@ -110,8 +107,8 @@ def find_jumps(
 ) -> SampleJumps:
     """The longest run of views in which the sample stood in one place.
 
-    A jump is one where views held out are predicted better with a shift and turn of the views on one side, or where
-    they are predicted worse by both sides than by one. The clearest one is sought first, then others on its sides.
+    A jump is one where views held out of the longer side are predicted worse by both sides than by that side, or those
+    of the other side far worse than these. The clearest one is sought first, then others on its sides.
 
     Args:
         frames: rows of the file that are to be used.
@@ -128,7 +125,7 @@ def find_jumps(
             f"The sample jumped at {where}. Views of a cone beam are not compared for that: they are used as if it had "
             "not moved. Choose those of one side with --views.",
         )
-    coarse, runs, most = _CoarseViews(scan, selection, axis_col), [frames], jumps.size * (jumps.size + 1) // 2
+    runs, most = [frames], jumps.size * (jumps.size + 1) // 2
     part = np.searchsorted(jumps, frames, side="right")
     steady = frames[np.bincount(part)[part] >= LEAST]  # views between two alarms are no part of a comparison
     real, at, n = list[int](), 0, 0
@@ -138,7 +135,7 @@ def find_jumps(
             if min((run < row).sum(), (run >= row).sum()) >= LEAST:
                 n += 1
                 progress(n, most)
-                if (clear := coarse.clearness(run, (run >= row).astype(np.int64))) > clearest:
+                if (clear := _clearness(scan, selection, axis_col, run, row)) > clearest:
                     clearest, best = clear, row
         if best:
             real.append(best)
@@ -169,43 +166,27 @@ def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
     return " ".join(text)
 
 
-@dataclass(frozen=True, eq=False)
-class _CoarseViews:
-    """Coarse pixels of some rows, in which parts of a scan are compared."""
+def _clearness(scan: ScanEvidence, selection: ScanSelection, axis_col: float, frames: I64, row: int) -> float:
+    """How clearly the sample stood elsewhere from `row` on in these rows of the file; 1 is the limit."""
+    from beamline.projections.correction import line_integrals_of
+    from recon.base.masks import areas
+    from recon.voxels.displacement import Displacement, judge
 
-    scan: ScanEvidence
-    selection: ScanSelection
-    axis_col: float
-
-    def clearness(self, frames: I64, part: I64) -> float:
-        """How clearly the sample stood elsewhere in one of two parts [view] of these rows; 1 is the limit."""
-        from beamline.projections.correction import line_integrals_of
-        from recon.base.masks import areas
-        from recon.voxels.displacement import Displacement, displacements, judge
-
-        step = max(1, math.ceil(frames.size / _VIEWS))
-        some = [np.flatnonzero(part == at) for at in (0, 1)]
-        looked = np.sort(np.concatenate([own[:: 1 if own.size <= _SHORT else step] for own in some]))
-        moves: list[Displacement] | None = None
-        for cols, rounds in _LEVELS:
-            band = _band(self.scan.source, self.selection, cols)
-            views = line_integrals_of(self.scan, band, frames[looked])
-            geometry = band.geometry(self.axis_col, self.scan.table.angles[views.view_ids])
-            group = part[np.searchsorted(frames, views.view_ids)]
-            seen = views.data, geometry, group, ~areas(views.masked)
-            moves = displacements(*seen, moves, rounds)
-        assert moves is not None
-        moved, still = judge(*seen, moves), judge(*seen, [Displacement()] * 2)
-        far = max(move.farthest(geometry.reach) for move in moves) / geometry.pixel_pitch
-        other = still.others[1 - still.longest] / (ALIKE * still.together)
-        jumped = (1 - _HELPS) * still.overall / moved.overall if far >= LARGEST else 0.0
-        return max(jumped, still.together / still.alone / (1 + _HELPS), other)
+    step = max(1, math.ceil(frames.size / _VIEWS))
+    sides = frames[frames < row], frames[frames >= row]
+    looked = np.concatenate([side[:: 1 if side.size <= _SHORT else step] for side in sides])
+    band = _band(scan.source, selection)
+    views = line_integrals_of(scan, band, looked)
+    geometry = band.geometry(axis_col, scan.table.angles[views.view_ids])
+    part = (views.view_ids >= row).astype(np.int64)
+    fit = judge(views.data, geometry, part, ~areas(views.masked), [Displacement()] * 2)
+    return max(fit.together / fit.alone / (1 + _ADDS), fit.others[1 - fit.longest] / (ALIKE * fit.together))
 
 
-def _band(source: ScanSource, selection: ScanSelection, cols: int) -> ScanSelection:
+def _band(source: ScanSource, selection: ScanSelection) -> ScanSelection:
     """Binned pixels, and rows around the middle of those that are used, also outside them."""
     width, height = source.shape[1] // selection.binning, source.shape[0]
-    binning = selection.binning * max(1, math.ceil(width / cols))
+    binning = selection.binning * max(1, math.ceil(width / _COLS))
     used = selection.detector_rows
     n = min(_ROWS * binning, height)
     first = min(max((used.start + used.stop - n) // 2, 0), height - n)
@@ -224,8 +205,8 @@ def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
     if selection.cone is not None or not (asked.judged or jumps.size):
         return 0
     n = min(source.table.views.size, _VIEWS + 2 * _SHORT)
-    band = _band(source, selection, _LEVELS[-1][0])
+    band = _band(source, selection)
     views = band.geometry((source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
     copy = 4 * n * math.prod(views.detector_shape)
     work = OsSirtTv(iterations=SWEEPS, momentum=True).memory(views, Grid.matching(views), weighted=True)
-    return copy + max(at_once_memory(source, band, n), work + _COPIES * copy)
+    return copy + max(at_once_memory(source, band, n), work)
