@@ -13,8 +13,9 @@ from beamline.core.text import count, frames_text
 from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
+from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import ScanSelection
-from beamline.projections.step import StepDone, StepMemory, option
+from beamline.projections.step import StepDone, StepMemory
 from beamline.projections.usable_views import UsableViews, usable_views
 from recon.base.volume import Grid
 
@@ -29,35 +30,19 @@ ALIKE = 1.5  # times the deviation of the longest part's views: a part that fits
 _ADDS = 0.005  # share of the deviation of the longest part's views that a part which fits may add
 _COLS, _ROWS, _VIEWS = 128, 16, 360  # binned pixels and views looked at, at most; parts of `_SHORT` views have all
 _SHORT = 40
-_REPAIRED = "`--jumps ignore --calibrate shifts` takes all views, and learns where each stood."
+_REPAIRED = "`--calibrate shifts` takes all views, and learns where each stood."
 
 
 @dataclass(frozen=True)
 class Jumps:
-    """How views on either side of a motion alarm are treated.
-
-    Attributes:
-        mode: "leave-out": see `find_jumps`. "ignore": they are used as they are.
-    """
+    """Leaves out views after a jump, see `find_jumps`; none where the place of each view is stated or learnt."""
 
     name: ClassVar[str] = "jumps"
     follows: ClassVar[tuple[str, ...]] = ("tilt", "phase")
     needs_finished: ClassVar[str] = ""
-    mode: str = option(
-        "--jumps",
-        "leave-out",
-        "leave-out: after the monitor saw the sample jump, leave out the views that do not fit the longest part. "
-        "ignore: use them as they are, as --calibrate shifts needs them.",
-        choices=("leave-out", "ignore"),
-    )
-
-    @property
-    def corrects_jumps(self) -> bool:
-        """Whether views after a jump are left out, in a finished scan."""
-        return self.mode == "leave-out"
 
     def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory(alone=_search_memory(part.source, part.selection) if self.corrects_jumps else 0)
+        return StepMemory(alone=_search_memory(part.source, part.selection))
 
     def place(
         self,
@@ -67,13 +52,10 @@ class Jumps:
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        if stated_poses(source, selection) is not None:  # it states where the sample was
+        learnt = any("shifts" in step.geometry for step in geometry_steps(selection))
+        if learnt or stated_poses(source, selection) is not None:
             return Unmoved(usable.frames)
-        if self.corrects_jumps:
-            return find_jumps(usable.scan, selection, usable.frames, usable.jumps, axis_col, progress)
-        where = frames_text(usable.jumps)
-        sentence = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
-        return SampleJumps(usable.frames, sentence if usable.jumps.size else "")
+        return find_jumps(usable.scan, selection, usable.frames, usable.jumps, axis_col, progress)
 
 
 @dataclass(frozen=True, eq=False)
