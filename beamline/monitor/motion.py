@@ -186,7 +186,7 @@ class MotionCheck(Logged):
             advice = (
                 f"The sample jumped by {across:+.1f} px across and {down:+.1f} px down between two views: it slipped "
                 "on its holder, or something touched it. Fix it if it may go on. The views are of use: "
-                "`beamline recon` leaves out those of the shorter side; --jumps ignore --calibrate shifts corrects "
+                "`beamline recon` leaves out those of the shorter side; --calibrate shifts corrects "
                 "them (cones: choose one side with --views)."
             )
         elif abs(turn) > limit_turn:

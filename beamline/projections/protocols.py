@@ -156,15 +156,6 @@ class PlaceStep(PrepStep, Protocol):
         """
 
 
-@runtime_checkable
-class JumpStep(Protocol):
-    """A step that knows of jumps of the sample."""
-
-    @property
-    def corrects_jumps(self) -> bool:
-        """Whether the step leaves out views beyond a jump, in a finished scan."""
-
-
 class GeometryLearnt(Protocol):
     """What was estimated of the geometry of some views.
 

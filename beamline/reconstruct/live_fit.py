@@ -25,7 +25,7 @@ from beamline.projections.consistency import compare_with_flats
 from beamline.projections.correction import ScanCorrection
 from beamline.projections.prepare import assemble
 from beamline.projections.prepared import PreparedProjections
-from beamline.projections.protocols import JumpStep, PlaceStep, ScanStep
+from beamline.projections.protocols import PlaceStep, ScanStep
 from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
@@ -324,8 +324,7 @@ class ScanFollower:
         assert self._correction is not None and self.axis_col is not None  # two views are there, and settled the axis
         self.state = FollowState.ENDED
         self._settle_newest()  # the scan was stopped: no other view comes
-        steps = in_order(self._selection)
-        if usable.jumps.size and any(isinstance(step, JumpStep) and step.corrects_jumps for step in steps):
+        if usable.jumps.size:
             self._warn(
                 f"The sample jumped at {frames_text(usable.jumps)}: this volume ignores that. "
                 "`beamline recon` on the finished file leaves out the views of the shorter side."

@@ -11,7 +11,6 @@ trustworthy as its modules. Checksums of zip and xz tell damage.
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import hashlib
 import io
@@ -22,7 +21,7 @@ import sys
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -38,7 +37,6 @@ _DAMAGE = (
 )
 _MARK = b"sha256:"  # before the digest at the end of a file, which pickle does not read
 _SEAL = len(_MARK) + hashlib.sha256().digest_size
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # the same files make the same archive
 
 
 @lru_cache(maxsize=8)
@@ -54,7 +52,7 @@ def carried(source: bytes) -> Mapping[str, bytes]:
 def _carried_modules(archive: Path) -> dict[str, str]:
     """Modules whose kernels can be used, by the digest of their source."""
     sources = read_sources(archive)
-    return {sources[module][_path(module)]: module for module in fresh_members(archive, ROOT)}
+    return {sources[module][source_path(module)]: module for module in fresh_members(archive, ROOT)}
 
 
 def fresh_members(archive: Path, root: Path) -> Iterator[str]:
@@ -87,28 +85,6 @@ def member(archive: Path, module: str) -> dict[str, bytes]:
     return files
 
 
-def write_archive(archive: Path, members: Mapping[str, Mapping[str, bytes]], root: Path) -> None:
-    """Writes the archive from the files of each module; the same files make the same bytes."""
-    sources = {}
-    with zipfile.ZipFile(archive, "w") as packed:
-        for module, files in sorted(members.items()):
-            sources[module] = {path: str(digest(root / path)) for path in source_files(module, root)}
-            packed.writestr(zipfile.ZipInfo(module, _EPOCH), lzma.compress(_tar(files)))
-        packed.writestr(
-            zipfile.ZipInfo(SOURCES, _EPOCH), json.dumps(sources, indent=0, allow_nan=False), zipfile.ZIP_DEFLATED
-        )
-
-
-def _tar(files: Mapping[str, bytes]) -> bytes:
-    content = io.BytesIO()
-    with tarfile.open(fileobj=content, mode="w") as tar:
-        for name, data in sorted(files.items()):
-            entry = tarfile.TarInfo(name)
-            entry.size = len(data)
-            tar.addfile(entry, io.BytesIO(data))
-    return content.getvalue()
-
-
 def digest(path: Path) -> str | None:
     """A digest of a file's content; None where it cannot be read."""
     try:
@@ -117,33 +93,9 @@ def digest(path: Path) -> str | None:
         return None
 
 
-def source_files(module: str, root: Path) -> list[str]:
-    """A module and all modules of this project that it imports when it is loaded, by path under the root."""
-    paths, waiting = set[str](), [_file(module, root)]
-    while waiting:
-        path = waiting.pop()
-        if path is not None and path not in paths:
-            paths.add(path)
-            waiting += (_file(name, root) for name in _imported(root / path))
-    return sorted(paths)
-
-
-def _path(module: str) -> str:
+def source_path(module: str) -> str:
+    """The source file of a module, by path under the root."""
     return "/".join(module.split(".")) + ".py"
-
-
-def _file(module: str, root: Path) -> str | None:
-    path = _path(module)
-    return path if (root / path).is_file() else None
-
-
-def _imported(path: Path) -> Iterable[str]:
-    for statement in ast.parse(path.read_text(encoding="utf-8")).body:
-        if isinstance(statement, ast.Import):
-            yield from (name.name for name in statement.names)
-        elif isinstance(statement, ast.ImportFrom) and statement.module is not None:
-            yield statement.module
-            yield from (f"{statement.module}.{name.name}" for name in statement.names)
 
 
 def sealed(content: bytes) -> bytes:

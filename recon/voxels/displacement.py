@@ -55,10 +55,6 @@ class Displacement:
     image: float = 0.0
     magnification: float = 1.0
 
-    def farthest(self, radius: float) -> float:
-        """Approximate upper bound of the motion, mm, of a point at this distance from the axis."""
-        return math.hypot(self.x, self.y, self.z) + abs(self.turn) * radius
-
 
 @dataclass(frozen=True)
 class DisplacementFit:

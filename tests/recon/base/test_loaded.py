@@ -98,5 +98,4 @@ def test_functions_import_no_library_that_cannot_be_interrupted() -> None:
     assert found == {
         *(f"recon/splatting/{module}.py: torch" for module in ("gaussians", "finish", "splat")),
         "recon/features/phase.py: numba",  # settings of numba, which the kernels of its module have loaded
-        "recon/compiled/__main__.py: numba",  # a program of its own
     }

@@ -20,10 +20,9 @@ from recon.compiled.archive import (
     member,
     read_sources,
     sealed,
-    source_files,
     unsealed,
-    write_archive,
 )
+from tests.compiled_kernels import source_files, write_archive
 
 KERNEL = """
 from numba import njit
@@ -48,9 +47,9 @@ def _project(root: Path) -> Path:
 
 @pytest.mark.skipif(not ARCHIVE.is_file(), reason="no archive")
 def test_the_archive_is_current() -> None:
-    """Else these kernels compile for every user: rebuild it with  python -m recon.compiled."""
+    """Else these kernels compile for every user: rebuild it with  python -m tests.compiled_kernels."""
     stale = set(read_sources(ARCHIVE)) - set(fresh_members(ARCHIVE, ROOT))
-    assert not stale, "edited since the archive was made: python -m recon.compiled"
+    assert not stale, "edited since the archive was made: python -m tests.compiled_kernels"
 
 
 def test_the_archive_names_what_kernels_are_compiled_from() -> None:

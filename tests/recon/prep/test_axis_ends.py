@@ -73,6 +73,13 @@ def test_steps_too_wide_for_the_sample_leave_it_uncertain_and_noise_too() -> Non
         assert not axis_from_ends(noise, half_turn(90)).confident
 
 
+@pytest.mark.parametrize("n", [5, 8, 12])
+def test_an_axis_by_few_views_of_a_wider_sample_is_right_or_called_uncertain(n: int) -> None:
+    for seed in range(4):
+        estimate = axis_from_sinogram(grains(seed, 2.0, half_turn(n), 47.3), half_turn(n))
+        assert abs(estimate.value - 47.3) < 1 or not estimate.confident
+
+
 def test_noise_of_flats_that_the_views_share_is_no_matter() -> None:
     """Flats of both ends are interpolated: views side by side share their noise, and join by it within the scan."""
     can, time = 0.3 * np.sqrt(1 - ((np.arange(COLS) - 47.5) / COLS) ** 2), np.linspace(0, 1, 90)[:, None, None]

@@ -63,7 +63,6 @@ def test_displaced_views_are_those_of_a_geometry_with_shifts() -> None:
         origin = seen.origin(view)
         assert across / PITCH + origin[0] - GEOMETRY.axis_col == pytest.approx(col[view] / PITCH)
         assert down / PITCH + origin[1] - GEOMETRY.axis_row == pytest.approx((point[2] + later[view] * MOVED.z) / PITCH)
-    assert Displacement(3.0, 4.0, 0.0, 0.1).farthest(10.0) == pytest.approx(6.0)
 
 
 def test_an_unmagnified_image_is_that_of_the_reference() -> None:

@@ -13,8 +13,9 @@ from beamline.core.text import count, frames_text
 from beamline.projections.corrections.poses import stated_poses
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.protocols import ScanPart, Unmoved, ViewMotion
+from beamline.projections.registry import geometry_steps
 from beamline.projections.selection import ScanSelection
-from beamline.projections.step import StepDone, StepMemory, option
+from beamline.projections.step import StepDone, StepMemory
 from beamline.projections.usable_views import UsableViews, usable_views
 from recon.base.volume import Grid
 
@@ -24,43 +25,24 @@ if TYPE_CHECKING:
     from recon.base.arrays import I64
     from recon.base.geometry import Geometry
 
-LARGEST = 0.5  # pixels looked at: a shorter way is none
 LEAST = 6  # views on a side that say whether the sample jumped there
 ALIKE = 1.5  # times the deviation of the longest part's views: a part that fits has no more
-_HELPS = 0.005  # share of the deviation that a jump takes away, or a part may add
-_LEVELS = ((64, 2), (128, 4))  # columns, at most, and volumes of all views
-_ROWS, _VIEWS = 16, 360  # binned rows and views looked at, at most; parts of `_SHORT` views have all
+_ADDS = 0.005  # share of the deviation of the longest part's views that a part which fits may add
+_COLS, _ROWS, _VIEWS = 128, 16, 360  # binned pixels and views looked at, at most; parts of `_SHORT` views have all
 _SHORT = 40
-_COPIES = 28  # float32 copies of the views looked at
-_REPAIRED = "`--jumps ignore --calibrate shifts` takes all views, and learns where each stood."
+_REPAIRED = "`--calibrate shifts` takes all views, and learns where each stood."
 
 
 @dataclass(frozen=True)
 class Jumps:
-    """How views on either side of a motion alarm are treated.
-
-    Attributes:
-        mode: "leave-out": see `find_jumps`. "ignore": they are used as they are.
-    """
+    """Leaves out views after a jump, see `find_jumps`; none where the place of each view is stated or learnt."""
 
     name: ClassVar[str] = "jumps"
     follows: ClassVar[tuple[str, ...]] = ("tilt", "phase")
     needs_finished: ClassVar[str] = ""
-    mode: str = option(
-        "--jumps",
-        "leave-out",
-        "leave-out: after the monitor saw the sample jump, leave out the views that do not fit the longest part. "
-        "ignore: use them as they are, as --calibrate shifts needs them.",
-        choices=("leave-out", "ignore"),
-    )
-
-    @property
-    def corrects_jumps(self) -> bool:
-        """Whether views after a jump are left out, in a finished scan."""
-        return self.mode == "leave-out"
 
     def memory(self, part: ScanPart) -> StepMemory:
-        return StepMemory(alone=_search_memory(part.source, part.selection) if self.corrects_jumps else 0)
+        return StepMemory(alone=_search_memory(part.source, part.selection))
 
     def place(
         self,
@@ -70,13 +52,10 @@ class Jumps:
         axis_col: float,
         progress: Callable[[int, int], None],
     ) -> ViewMotion:
-        if stated_poses(source, selection) is not None:  # it states where the sample was
+        learnt = any("shifts" in step.geometry for step in geometry_steps(selection))
+        if learnt or stated_poses(source, selection) is not None:
             return Unmoved(usable.frames)
-        if self.corrects_jumps:
-            return find_jumps(usable.scan, selection, usable.frames, usable.jumps, axis_col, progress)
-        where = frames_text(usable.jumps)
-        sentence = f"The monitor saw the sample jump at {where}; --jumps ignore: views are used as they are."
-        return SampleJumps(usable.frames, sentence if usable.jumps.size else "")
+        return find_jumps(usable.scan, selection, usable.frames, usable.jumps, axis_col, progress)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +89,8 @@ def find_jumps(
 ) -> SampleJumps:
     """The longest run of views in which the sample stood in one place.
 
-    A jump is one where views held out are predicted better with a shift and turn of the views on one side, or where
-    they are predicted worse by both sides than by one. The clearest one is sought first, then others on its sides.
+    A jump is one where views held out of the longer side are predicted worse by both sides than by that side, or those
+    of the other side far worse than these. The clearest one is sought first, then others on its sides.
 
     Args:
         frames: rows of the file that are to be used.
@@ -128,7 +107,7 @@ def find_jumps(
             f"The sample jumped at {where}. Views of a cone beam are not compared for that: they are used as if it had "
             "not moved. Choose those of one side with --views.",
         )
-    coarse, runs, most = _CoarseViews(scan, selection, axis_col), [frames], jumps.size * (jumps.size + 1) // 2
+    runs, most = [frames], jumps.size * (jumps.size + 1) // 2
     part = np.searchsorted(jumps, frames, side="right")
     steady = frames[np.bincount(part)[part] >= LEAST]  # views between two alarms are no part of a comparison
     real, at, n = list[int](), 0, 0
@@ -138,7 +117,7 @@ def find_jumps(
             if min((run < row).sum(), (run >= row).sum()) >= LEAST:
                 n += 1
                 progress(n, most)
-                if (clear := coarse.clearness(run, (run >= row).astype(np.int64))) > clearest:
+                if (clear := _clearness(scan, selection, axis_col, run, row)) > clearest:
                     clearest, best = clear, row
         if best:
             real.append(best)
@@ -169,43 +148,27 @@ def _sentence_on_jumps(real: I64, jumps: I64, lost: int) -> str:
     return " ".join(text)
 
 
-@dataclass(frozen=True, eq=False)
-class _CoarseViews:
-    """Coarse pixels of some rows, in which parts of a scan are compared."""
+def _clearness(scan: ScanEvidence, selection: ScanSelection, axis_col: float, frames: I64, row: int) -> float:
+    """How clearly the sample stood elsewhere from `row` on in these rows of the file; 1 is the limit."""
+    from beamline.projections.correction import line_integrals_of
+    from recon.base.masks import areas
+    from recon.voxels.displacement import Displacement, judge
 
-    scan: ScanEvidence
-    selection: ScanSelection
-    axis_col: float
-
-    def clearness(self, frames: I64, part: I64) -> float:
-        """How clearly the sample stood elsewhere in one of two parts [view] of these rows; 1 is the limit."""
-        from beamline.projections.correction import line_integrals_of
-        from recon.base.masks import areas
-        from recon.voxels.displacement import Displacement, displacements, judge
-
-        step = max(1, math.ceil(frames.size / _VIEWS))
-        some = [np.flatnonzero(part == at) for at in (0, 1)]
-        looked = np.sort(np.concatenate([own[:: 1 if own.size <= _SHORT else step] for own in some]))
-        moves: list[Displacement] | None = None
-        for cols, rounds in _LEVELS:
-            band = _band(self.scan.source, self.selection, cols)
-            views = line_integrals_of(self.scan, band, frames[looked])
-            geometry = band.geometry(self.axis_col, self.scan.table.angles[views.view_ids])
-            group = part[np.searchsorted(frames, views.view_ids)]
-            seen = views.data, geometry, group, ~areas(views.masked)
-            moves = displacements(*seen, moves, rounds)
-        assert moves is not None
-        moved, still = judge(*seen, moves), judge(*seen, [Displacement()] * 2)
-        far = max(move.farthest(geometry.reach) for move in moves) / geometry.pixel_pitch
-        other = still.others[1 - still.longest] / (ALIKE * still.together)
-        jumped = (1 - _HELPS) * still.overall / moved.overall if far >= LARGEST else 0.0
-        return max(jumped, still.together / still.alone / (1 + _HELPS), other)
+    step = max(1, math.ceil(frames.size / _VIEWS))
+    sides = frames[frames < row], frames[frames >= row]
+    looked = np.concatenate([side[:: 1 if side.size <= _SHORT else step] for side in sides])
+    band = _band(scan.source, selection)
+    views = line_integrals_of(scan, band, looked)
+    geometry = band.geometry(axis_col, scan.table.angles[views.view_ids])
+    part = (views.view_ids >= row).astype(np.int64)
+    fit = judge(views.data, geometry, part, ~areas(views.masked), [Displacement()] * 2)
+    return max(fit.together / fit.alone / (1 + _ADDS), fit.others[1 - fit.longest] / (ALIKE * fit.together))
 
 
-def _band(source: ScanSource, selection: ScanSelection, cols: int) -> ScanSelection:
+def _band(source: ScanSource, selection: ScanSelection) -> ScanSelection:
     """Binned pixels, and rows around the middle of those that are used, also outside them."""
     width, height = source.shape[1] // selection.binning, source.shape[0]
-    binning = selection.binning * max(1, math.ceil(width / cols))
+    binning = selection.binning * max(1, math.ceil(width / _COLS))
     used = selection.detector_rows
     n = min(_ROWS * binning, height)
     first = min(max((used.start + used.stop - n) // 2, 0), height - n)
@@ -224,8 +187,8 @@ def _search_memory(source: ScanSource, selection: ScanSelection) -> int:
     if selection.cone is not None or not (asked.judged or jumps.size):
         return 0
     n = min(source.table.views.size, _VIEWS + 2 * _SHORT)
-    band = _band(source, selection, _LEVELS[-1][0])
+    band = _band(source, selection)
     views = band.geometry((source.shape[1] - 1) / 2, np.linspace(0, math.pi, n, endpoint=False))
     copy = 4 * n * math.prod(views.detector_shape)
     work = OsSirtTv(iterations=SWEEPS, momentum=True).memory(views, Grid.matching(views), weighted=True)
-    return copy + max(at_once_memory(source, band, n), work + _COPIES * copy)
+    return copy + max(at_once_memory(source, band, n), work)

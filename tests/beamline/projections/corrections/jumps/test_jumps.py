@@ -13,7 +13,7 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.motion import MotionCheck
 from beamline.monitor.opposite import OppositeCheck
 from beamline.projections.corrections.air import Air
-from beamline.projections.corrections.jumps.jumps import Jumps
+from beamline.projections.corrections.calibration.calibrate import Calibrate
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
@@ -49,7 +49,7 @@ def test_views_after_a_jump_are_left_out(tmp_path: Path) -> None:
     found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), replace(SELECTION, views="first:30"))
     assert found.geometry.n_views == 30 and found.left_out == 19 and found.view_weights is None
     assert "The sample jumped at frame 45. 19 views are left out" in told
-    assert "`--jumps ignore --calibrate shifts`" in told and found.done["jumps"].sentence in told
+    assert "`--calibrate shifts` takes all" in told and found.done["jumps"].sentence in told
 
 
 def test_another_sample_after_the_jump_is_left_out(tmp_path: Path) -> None:
@@ -79,7 +79,6 @@ def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
     ("selection", "said"),
     [
         (SELECTION.with_steps(Preparation("ignore")), "--flags ignore: 1 view with an alarm"),
-        (SELECTION.with_steps(Jumps("ignore")), "The monitor saw the sample jump at frame 45; --jumps ignore"),
         (replace(SELECTION, cone=(100.0, 200.0)), "Views of a cone beam are not compared"),
     ],
 )
@@ -87,3 +86,11 @@ def test_who_wants_them_as_they_are_and_cones_get_them_so(tmp_path: Path, select
     found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), selection)
     assert found.geometry.n_views == ANGLES.size and not found.geometry.shifts.any()
     assert said in told
+
+
+@pytest.mark.slow
+def test_all_views_are_used_where_the_place_of_each_is_learnt(tmp_path: Path) -> None:
+    found, told = prepared(scan(tmp_path, moved(1.5, 1.0), JUMP), SELECTION.with_steps(Calibrate(("shifts",))))
+    assert found.geometry.n_views == ANGLES.size and "left out" not in told
+    down = found.geometry.shifts[LATER, 1].mean() - found.geometry.shifts[~LATER, 1].mean()
+    assert down == pytest.approx(1.0, abs=0.2)

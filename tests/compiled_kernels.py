@@ -1,4 +1,4 @@
-"""python -m recon.compiled [CHECKOUT ...]: compiles the kernels for every level, and packs them.
+"""python -m tests.compiled_kernels [CHECKOUT ...]: compiles the kernels for every level, and packs them.
 
 Which kernels, and for which types, is taken from the archive, and from what numba has compiled for this checkout and
 for others that are named: after the tests, all that they call. So a kernel that is edited or new is compiled here for
@@ -7,16 +7,22 @@ all levels, and everything else keeps its bytes. No kernel runs, so the machine 
 
 from __future__ import annotations
 
+import ast
 import gc
 import hashlib
 import importlib
+import io
+import json
+import lzma
 import os
 import pickle
 import subprocess
 import sys
+import tarfile
 import time
+import zipfile
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -25,15 +31,17 @@ from recon.compiled import LEVELS, ROOT
 from recon.compiled.archive import (
     ARCHIVE,
     PYTHONS,
+    SOURCES,
     digest,
     fresh_members,
     member,
     read_sources,
+    source_path,
     unsealed,
-    write_archive,
 )
 
 PACKAGES = ("beamline", "recon", "simulators")
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # the same files make the same archive
 Index = dict[Any, str]
 """Names of files with object code by what they were compiled for: (types, processor, code)."""
 
@@ -46,7 +54,7 @@ def main() -> int:
     for level in LEVELS:
         begin = time.perf_counter()
         # numba before recon: the level holds although this processor may have another
-        run = "import numba, sys; from recon.compiled.__main__ import compile_for; compile_for(sys.argv[1:])"
+        run = "import numba, sys; from tests.compiled_kernels import compile_for; compile_for(sys.argv[1:])"
         words = [sys.executable, "-c", run, *(str(Path(checkout).resolve()) for checkout in sys.argv[1:])]
         done = subprocess.run(words, cwd=ROOT, env=os.environ | level.environment, check=False)
         sys.stdout.write(f"{level.name}: {time.perf_counter() - begin:.0f} s\n")
@@ -163,6 +171,53 @@ def _packed(module: str, carried: Mapping[str, bytes]) -> dict[str, bytes]:
             ordered = dict(sorted(renamed.items(), key=lambda item: item[1]))
             files[name] = pickle.dumps(__version__, -1) + dumps((stamp, ordered))
     return files
+
+
+def write_archive(archive: Path, members: Mapping[str, Mapping[str, bytes]], root: Path) -> None:
+    """Writes the archive from the files of each module; the same files make the same bytes."""
+    sources = {}
+    with zipfile.ZipFile(archive, "w") as packed:
+        for module, files in sorted(members.items()):
+            sources[module] = {path: str(digest(root / path)) for path in source_files(module, root)}
+            packed.writestr(zipfile.ZipInfo(module, _EPOCH), lzma.compress(_tar(files)))
+        packed.writestr(
+            zipfile.ZipInfo(SOURCES, _EPOCH), json.dumps(sources, indent=0, allow_nan=False), zipfile.ZIP_DEFLATED
+        )
+
+
+def _tar(files: Mapping[str, bytes]) -> bytes:
+    content = io.BytesIO()
+    with tarfile.open(fileobj=content, mode="w") as tar:
+        for name, data in sorted(files.items()):
+            entry = tarfile.TarInfo(name)
+            entry.size = len(data)
+            tar.addfile(entry, io.BytesIO(data))
+    return content.getvalue()
+
+
+def source_files(module: str, root: Path) -> list[str]:
+    """A module and all modules of this project that it imports when it is loaded, by path under the root."""
+    paths, waiting = set[str](), [_file(module, root)]
+    while waiting:
+        path = waiting.pop()
+        if path is not None and path not in paths:
+            paths.add(path)
+            waiting += (_file(name, root) for name in _imported(root / path))
+    return sorted(paths)
+
+
+def _file(module: str, root: Path) -> str | None:
+    path = source_path(module)
+    return path if (root / path).is_file() else None
+
+
+def _imported(path: Path) -> Iterable[str]:
+    for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+        if isinstance(statement, ast.Import):
+            yield from (name.name for name in statement.names)
+        elif isinstance(statement, ast.ImportFrom) and statement.module is not None:
+            yield statement.module
+            yield from (f"{statement.module}.{name.name}" for name in statement.names)
 
 
 if __name__ == "__main__":
