@@ -19,7 +19,7 @@ from recon.base.method import SampleRadius
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
-from recon.prep.correct import Projections
+from recon.prep.projections import Projections
 from recon.voxels.projector import seen_rays
 
 

@@ -82,7 +82,7 @@ class Air:
 
     @property
     def columns(self) -> Columns:
-        """The (left, right) columns of air, as in `recon.prep.correct.CorrectionSettings`."""
+        """The (left, right) columns of air, as in `recon.prep.counts_plan.CorrectionSettings`."""
         return _parts(self.model)[0]
 
     @property
