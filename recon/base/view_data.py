@@ -47,6 +47,11 @@ class Views:
         data, weights = masked(self.data, self.weights)
         return self if data is self.data and weights is self.weights else replace(self, data=data, weights=weights)
 
+    def weighed(self, factor: NDArray[np.generic]) -> Views:
+        """The views with the weights of rays times a factor, which fits [view, row, col]."""
+        factor = np.broadcast_to(factor, self.data.shape).astype(np.float32)
+        return replace(self, weights=factor if self.weights is None else self.weights * factor)
+
     def binned(self, factor: int, geometry: Geometry | None = None) -> Views:
         """Views with factor x factor pixels joined: their weighted means, with their mean weight.
 
