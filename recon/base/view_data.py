@@ -72,8 +72,14 @@ class Views:
         return self.select(seen), self.select(unseen)
 
 
-def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Views to reconstruct from, and one in `one_in` held out, evenly spread in angle."""
-    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
+def split_views(
+    geometry: Geometry, one_in: int = ONE_IN, period: float | None = None
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Views to reconstruct from, and one in `one_in` held out, evenly spread in angle.
+
+    Args:
+        period: radians after which angles are the same; None: that of the geometry, which depends on the axis.
+    """
+    order = np.argsort(np.mod(geometry.angles, period or geometry.period), kind="stable")
     unseen = np.sort(order[one_in // 2 :: one_in])
     return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen
