@@ -36,6 +36,7 @@ from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
+from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
@@ -139,9 +140,8 @@ def _with_held_out(
         held_out = correction.at_once(others)
         prepared = replace(
             prepared,
-            held_out=(held_out.data, view_geometry.of(held_out.view_ids)),
+            held_out=Views(held_out.data, view_geometry.of(held_out.view_ids), held_out.weights),
             held_out_ids=held_out.view_ids,
-            held_out_weights=held_out.weights,
         )
     return prepared
 
