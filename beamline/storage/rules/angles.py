@@ -18,7 +18,7 @@ _EQUAL, _FEW = 1e-3, 4  # degrees between views of one direction; columns of the
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
-_MANY = 30  # views from which on a span tells that it is in no degrees
+_MANY = 30  # views: fewer within 6.28 degrees may be a trial scan, and are not refused as radians
 
 
 def angles_unknown(scan: ScanEvidence) -> str:
