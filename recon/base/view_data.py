@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32, bin_views
+from recon.base.arrays import F32, Mask, bin_views
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -47,10 +47,10 @@ class Views:
         data, weights = masked(self.data, self.weights)
         return self if data is self.data and weights is self.weights else replace(self, data=data, weights=weights)
 
-    def weighed(self, factor: NDArray[np.generic]) -> Views:
-        """The views with the weights of rays times a factor, which fits [view, row, col]."""
-        factor = np.broadcast_to(factor, self.data.shape).astype(np.float32)
-        return replace(self, weights=factor if self.weights is None else self.weights * factor)
+    def weighed(self, factor: F32 | Mask) -> Views:
+        """The views with the weights of rays times a factor, of a shape that goes with [view, row, col]."""
+        ones = np.broadcast_to(np.float32(1), self.data.shape) if self.weights is None else self.weights
+        return replace(self, weights=ones * factor)
 
     def binned(self, factor: int, geometry: Geometry | None = None) -> Views:
         """Views with factor x factor pixels joined: their weighted means, with their mean weight.
