@@ -210,7 +210,7 @@ class PreparedProjections:
         if self.view_weights is not None:
             factors.append(_and_ones(self.view_weights, others)[:, None, None])
         if (counted := self.projections.weights) is not None:
-            usual, unseen = counted.mean(where=counted > 0), self.held_out and self.held_out.weights
+            usual, unseen = counted.mean(where=counted > 0), None if self.held_out is None else self.held_out.weights
             if unseen is not None and len(unseen) == others:
                 factors.append(np.concatenate((counted, unseen)) / usual)
             else:

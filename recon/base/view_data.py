@@ -50,7 +50,7 @@ class Views:
     def weighed(self, factor: F32 | Mask) -> Views:
         """The views with the weights of rays times a factor, of a shape that goes with [view, row, col]."""
         ones = np.broadcast_to(np.float32(1), self.data.shape) if self.weights is None else self.weights
-        return replace(self, weights=ones * factor)
+        return replace(self, weights=np.multiply(ones, factor, dtype=np.float32))
 
     def binned(self, factor: int, geometry: Geometry | None = None) -> Views:
         """Views with factor x factor pixels joined: their weighted means, with their mean weight.
