@@ -39,8 +39,11 @@ if TYPE_CHECKING:
     from recon.features.published.r2_published import R2Published as R2Published
     from recon.features.rings import WithoutRings, remove_rings
     from recon.prep.align import AxisEstimate, find_axis
-    from recon.prep.correct import CorrectionSettings, Projections, References, correct
+    from recon.prep.correct import correct
     from recon.prep.counts import Counts
+    from recon.prep.counts_plan import CorrectionSettings
+    from recon.prep.projections import Projections
+    from recon.prep.references import References
     from recon.reconstruction import reconstruct
     from recon.splatting.gaussians import Gaussians
     from recon.splatting.r2 import R2
@@ -106,7 +109,10 @@ _LAZY = {
     "AxisEstimate": "recon.prep.align",
     "axis_by_views": "recon.axis_held_out",
     "find_axis": "recon.prep.align",
-    **dict.fromkeys(("CorrectionSettings", "Projections", "References", "correct"), "recon.prep.correct"),
+    "CorrectionSettings": "recon.prep.counts_plan",
+    "Projections": "recon.prep.projections",
+    "References": "recon.prep.references",
+    "correct": "recon.prep.correct",
     "Counts": "recon.prep.counts",
     **dict.fromkeys(("WithoutRings", "remove_rings"), "recon.features.rings"),
     "reconstruct": "recon.reconstruction",

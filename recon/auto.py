@@ -115,9 +115,8 @@ def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates
     told = replace(control, on_progress=control.on_progress if control.decide is None else None)
     sweeps = max(_sweeps(each) for each in candidates)
     watch = Watch(on_trial=TrialWatch(told, problem.geometry.n_views, sweeps))
-    given = problem.views.masked()
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
-    scan, _ = scaled_problem(projector, given.data, given.weights, None, True, watch, decide)
+    scan, _ = scaled_problem(projector, problem.views.masked(), None, True, watch, decide)
     return Trial.of(scan, TrialSettings(problem.wide, all_rows, control.now))
 
 

@@ -12,6 +12,7 @@ from recon.base.arrays import F32, bin_views
 from recon.base.declared_types import check_arguments
 from recon.base.geometry import Geometry
 from recon.base.units import warn_of_other_quantity
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.prep.align import AxisError, AxisEstimate
 from recon.voxels.field_edges import wider_than_field
@@ -139,7 +140,8 @@ class _Residuals:
         if axis_col not in self.found:
             views = self._moved(axis_col)
             grid, method = self.grid or self.grid_about(axis_col), FistaTv(self.sweeps, _TV_WEIGHT)
-            unseen, images = predicted_views(method, self.data, views, grid, self.lit, _ONE_IN)
+            weights = None if self.lit is None else self.lit.astype(np.float32)
+            unseen, images = predicted_views(method, Views(self.data, views, weights), grid, _ONE_IN)
             lit = 1 if self.lit is None else self.lit[unseen]
             measured = self.data[unseen] * lit
             matter = _norm(measured)

@@ -18,7 +18,7 @@ from recon.base.volume import Grid, Volume
 from recon.methods import names_where, with_settings
 from recon.splatting.fit_method import Fit
 from recon.voxels.direct import Fbp, direct
-from recon.voxels.iterative import VoxelMethod, Watch, solve
+from recon.voxels.iterative import VoxelMethod, Watch, solve_views
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.projector import Projector
 
@@ -158,7 +158,6 @@ def _refitted(
     sweeps, begin, done, stopped = refit.iterations, control.now(), 0, False
     follow = decided if _LIMITS in decided else _of_run(decided, sweeps)
     given = problem.views.masked()
-    data, known = given.data, given.weights
     projector, signs = Projector(problem.geometry, problem.grid), alternating(problem.geometry)[:, None, None]
 
     def told(iteration: int, residual: float) -> bool:
@@ -170,11 +169,10 @@ def _refitted(
 
     volumes: list[F32] = []
     for sign in (1, -1):
-        trust = np.broadcast_to(1 + np.float32(sign * _EXTRA) * signs, data.shape)
+        trusted = given.weighed(1 + np.float32(sign * _EXTRA) * signs)
         decide = Decisions(problem.seed, follow)
-        refitted = solve(
-            refit, projector, data, weight=trust.copy() if known is None else known * trust, start=volume,
-            nonnegative=not method.allow_negative, watch=Watch(told),
+        refitted = solve_views(
+            refit, projector, trusted, start=volume, nonnegative=not method.allow_negative, watch=Watch(told),
             decide=decide,
         )  # fmt: skip
         if stopped:

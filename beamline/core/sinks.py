@@ -55,15 +55,6 @@ def sentence(event: Event) -> str | None:
         case FrameFlagged(flag):
             where = "frame" if len(flag.frames) == 1 else f"{len(flag.frames)} frames, {flag.frames.start} to"
             return f"{flag.level.capitalize()} ({flag.check}, {where} {flag.frame}): {flag.advice}"
-        case ReconStarted():
-            again = " again, from the start" if event.again else ""
-            return f"{event.method}{again}: {event.n_views} views, rotation axis at column {event.axis_col:.2f}"
-        case TrialsStarted(file, trials=trials, by=by):
-            return f"{trials} trials of {file}, quality by {by}"
-        case TrialDone():
-            return _trial(event)
-        case SnapshotWritten(path, n_views=n_views):
-            return f"Volume from {n_views} views so far: {path}"
         case PassEnded():
             return "\n".join(lines(event))
         case NextChosen():
@@ -73,12 +64,27 @@ def sentence(event: Event) -> str | None:
             again = f", {scan.retaken} views taken again" if scan.retaken else ""
             head = f"Scan {scan.status}: {scan.n_frames} frames{again}{alarms}, {size(scan.bytes)}"
             return f"{head}, {scan.seconds:.1f} s: {scan.path}"
-        case ReconDone(values):
-            return f"Volume: {values.get('output', '')}"
         case Failed(message):
             return f"Failed: {message}"
         case RunDone(folder):
             return f"Done: {folder}"
+    return _of_reconstruction(event)
+
+
+def _of_reconstruction(event: Event) -> str | None:
+    """The sentence of an event of `recon_events`."""
+    match event:
+        case ReconStarted():
+            again = " again, from the start" if event.again else ""
+            return f"{event.method}{again}: {event.n_views} views, rotation axis at column {event.axis_col:.2f}"
+        case TrialsStarted(file, trials=trials, by=by):
+            return f"{trials} trials of {file}, quality by {by}"
+        case TrialDone():
+            return _trial(event)
+        case SnapshotWritten(path, n_views=n_views):
+            return f"Volume from {n_views} views so far: {path}"
+        case ReconDone(values):
+            return f"Volume: {values.get('output', '')}"
     return None
 
 

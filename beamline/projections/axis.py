@@ -24,7 +24,7 @@ from recon.base.views import spread, spread_views
 from recon.prep.align import AxisError, AxisEstimate, find_axis
 from recon.prep.axis_ends import ENDS
 from recon.prep.axis_wedge import AGREE
-from recon.prep.correct import Projections
+from recon.prep.projections import Projections
 
 _AXIS_VIEWS = 360  # more views do not sharpen the axis, they only cost reading
 _AXIS_ROWS = 64

@@ -23,8 +23,8 @@ from recon.base.arrays import F32, F64, median_deviation
 from recon.base.geometry import Geometry
 from recon.base.noise import NOISE_VIEWS, noise_level
 from recon.base.views import spread
-from recon.prep.correct import Projections
 from recon.prep.moments import ViewMoments, moments_of
+from recon.prep.projections import Projections
 from recon.prep.repeats import changes_seen
 from recon.prep.tilt import roll_of_mean_view
 from recon.voxels.field_edges import FieldEdges

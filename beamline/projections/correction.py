@@ -24,16 +24,11 @@ from beamline.storage.frame_table import FrameTable
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import altered_sentence
-from recon.prep import correct
-from recon.prep.correct import (
-    CorrectionPlan,
-    LinesPlan,
-    Plan,
-    Projections,
-    UnlitViewsError,
-    apply,
-    merge_and_empty,
-)
+from recon.prep import counts_plan
+from recon.prep.correct import Plan, apply
+from recon.prep.counts_plan import CorrectionPlan, UnlitViewsError
+from recon.prep.lines_plan import LinesPlan
+from recon.prep.projections import Projections, merge_and_empty
 
 _COPIES = 3  # float32 copies of the views that are corrected at once
 _STEPS = 3  # of a frame: it is read, divided by the flat, and freed of spots
@@ -73,7 +68,7 @@ class ScanCorrectionPlan:
         if beam is None:
             return LinesPlan.of(self.preparation.zinger_threshold, foreign)
         references, photons, light = beam.references.rows(read), beam.photons, beam.light
-        return correct.survey(
+        return counts_plan.survey(
             references, beam.settings, standing=standing, photons=photons, foreign=foreign, light=light
         )  # fmt: skip
 

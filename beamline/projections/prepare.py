@@ -30,16 +30,17 @@ from beamline.projections.scan_warnings import (
 from beamline.projections.selection import ScanSelection, Selection, choose_views
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, asked_of, checked_views, evidence_of
+from beamline.projections.views import ViewGeometry, checked_views, evidence_of
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import I64
 from recon.base.geometry import Geometry
 from recon.base.masks import areas, masked
+from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.prep.align import AxisEstimate
-from recon.prep.correct import Projections
+from recon.prep.projections import Projections
 from recon.voxels.projector import seen_rays
 
 _HELD_OUT_VIEWS = 16
@@ -84,10 +85,10 @@ def prepare_projections(
     phases = phases or Phases()
     phases.enter("flags and references")
     selection = selection.of(source)
-    scan = ScanEvidence(source, asked_of(source, selection))
+    scan = evidence_of(source, selection)
     usable, poses, wide = _usable(scan, selection, warn)
     phases.enter("tilt and references", "bands")
-    selection, sought = with_tilt(scan, selection, usable.frames, warn, phases.progress)
+    selection, tilt = with_tilt(scan, selection, usable.frames, warn, phases.progress)
     correction = ScanCorrection(scan, selection, warn, usable.frames)
     if poses is None and selection.step(TiltAndLens).tilt is None and selection.cone is None:
         warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
@@ -114,7 +115,6 @@ def prepare_projections(
     place = view_geometry.axis_col, axis
     prepared = assemble(scan, selection, projections, geometry, place, usable, warn, buffer is not None)
     prepared = _with_held_out(prepared, correction, view_geometry, others)
-    tilt = {"tilt": selection.step(TiltAndLens).done(sought)} if sought else {}
     prepared = replace(prepared, done={**correction.plan.done, **tilt, **view_geometry.done})
     prepared = _after_scan_steps(source, selection, prepared, phases)
     prepared = replace(prepared, laws={**light, **warn_of_inconsistency(prepared.centred, selection, warn)})
@@ -140,9 +140,8 @@ def _with_held_out(
         held_out = correction.at_once(others)
         prepared = replace(
             prepared,
-            held_out=(held_out.data, view_geometry.of(held_out.view_ids)),
+            held_out=Views(held_out.data, view_geometry.of(held_out.view_ids), held_out.weights),
             held_out_ids=held_out.view_ids,
-            held_out_weights=held_out.weights,
         )
     return prepared
 

@@ -19,7 +19,7 @@ from recon.base.method import SampleRadius
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.prep.align import AxisEstimate
-from recon.prep.correct import Projections
+from recon.prep.projections import Projections
 from recon.voxels.projector import seen_rays
 
 
@@ -32,9 +32,9 @@ class PreparedProjections:
         geometry: of these views, binned; mm, or px where the pixel size is unknown.
         axis_col: rotation axis in columns of the full detector.
         axis: how it was found; None where it was given.
-        held_out: line integrals of some views that are not used, and their geometry; None where all are used.
+        held_out: some views that are not used, with weights as `projections.weights` of the views used (None: as a
+            usual ray of these); None where all are used.
         held_out_ids: rows of the file of these views; None: unknown.
-        held_out_weights: of their rays, as `projections.weights` of the views used; None: as a usual ray of these.
         n_projections: how many views the scan has.
         length_unit: "mm" or "px".
         quantity: what the pixels were: "counts", which were corrected, or "line_integrals".
@@ -57,7 +57,7 @@ class PreparedProjections:
     geometry: Geometry
     axis_col: float
     axis: AxisEstimate | None
-    held_out: tuple[NDArray[np.float32], Geometry] | None
+    held_out: Views | None
     n_projections: int
     length_unit: str
     quantity: str
@@ -69,7 +69,6 @@ class PreparedProjections:
     done: Mapping[str, StepDone] = field(default_factory=dict)
     shares_of: Callable[[slice, slice], NDArray[np.float32] | None] | None = None
     held_out_ids: NDArray[np.int64] | None = None
-    held_out_weights: NDArray[np.float32] | None = None
     times: NDArray[np.float64] | None = None
     sample_radius: float | SampleRadius | None = None
     inside: bool = False
@@ -106,16 +105,13 @@ class PreparedProjections:
         def cut(array: NDArray[Any] | None) -> NDArray[Any] | None:
             return None if array is None else array[..., rows, :]
 
-        whole, held = self.projections, self.held_out
-        if held is not None:
-            held = held[0][:, rows], held[1].rows(rows.start, rows.stop)
+        whole = self.projections
         shares = cut(self.shares) if self.shares_of is None else self.shares_of(slice(None), rows)
         return replace(
             self,
             projections=replace(whole, data=whole.data[:, rows], masked=whole.masked[rows], weights=cut(whole.weights)),
             geometry=geometry,
-            held_out=held,
-            held_out_weights=cut(self.held_out_weights),
+            held_out=None if self.held_out is None else self.held_out.rows(rows),
             measured=cut(self.measured),
             shares=shares,
             shares_of=None,
@@ -189,10 +185,9 @@ class PreparedProjections:
         """The views held out, likewise; None where all are used."""
         if self.held_out is None:
             return None
-        data, geometry = self.held_out
-        weights, n = self.ray_factors(geometry.n_views), self.geometry.n_views
+        weights, n = self.ray_factors(self.held_out.geometry.n_views), self.geometry.n_views
         later: Any = None if weights is None else RayWeights(tuple(factor[n:] for factor in weights.factors))
-        return Views(data, geometry, later)
+        return replace(self.held_out, weights=later)
 
     def ray_weights(self, others: int = 0) -> NDArray[np.float32] | None:
         """Weights [view, row, col] from `ray_factors`, read-only."""
@@ -215,7 +210,7 @@ class PreparedProjections:
         if self.view_weights is not None:
             factors.append(_and_ones(self.view_weights, others)[:, None, None])
         if (counted := self.projections.weights) is not None:
-            usual, unseen = counted.mean(where=counted > 0), self.held_out_weights
+            usual, unseen = counted.mean(where=counted > 0), None if self.held_out is None else self.held_out.weights
             if unseen is not None and len(unseen) == others:
                 factors.append(np.concatenate((counted, unseen)) / usual)
             else:
@@ -225,8 +220,8 @@ class PreparedProjections:
         if self.leaves_slices:
             seen = seen_rays(self.geometry, grid := Grid.matching(self.geometry))
             held = np.ones((others, 1, 1), np.bool_)
-            if self.held_out is not None and others == self.held_out[1].n_views:
-                held = seen_rays(self.held_out[1], grid)
+            if self.held_out is not None and others == self.held_out.geometry.n_views:
+                held = seen_rays(self.held_out.geometry, grid)
             rays = np.broadcast_shapes(seen.shape[1:], held.shape[1:])
             factors.append(np.concatenate([np.broadcast_to(part, (len(part), *rays)) for part in (seen, held)]))
             factors[-1] = factors[-1].astype(np.float32)
@@ -243,18 +238,15 @@ def _and_ones(values: NDArray[np.float32], others: int) -> NDArray[np.float32]:
     return np.concatenate((values, np.ones((others, *values.shape[1:]), np.float32)))
 
 
-def with_held_out(
-    projections: F32, geometry: Geometry, held_out: tuple[F32, Geometry] | None
-) -> tuple[F32, Geometry, list[int]]:
+def with_held_out(projections: F32, geometry: Geometry, held_out: Views | None) -> tuple[F32, Geometry, list[int]]:
     """Used and held-out views as one set, and the numbers of the held-out views in it.
 
     The two geometries are of the same set-up.
     """
     if held_out is None:
         return projections, geometry, []
-    data, others = held_out
-    together = geometry.followed_by(others)
-    return np.concatenate((projections, data)), together, list(range(geometry.n_views, together.n_views))
+    together = geometry.followed_by(held_out.geometry)
+    return np.concatenate((projections, held_out.data)), together, list(range(geometry.n_views, together.n_views))
 
 
 def hold_out(
@@ -283,10 +275,9 @@ def hold_out(
 
 def with_views_held_out(prepared: PreparedProjections, held: I64) -> PreparedProjections:
     """The same views with those of these numbers, sorted, held out."""
-    projections, counted = prepared.projections, prepared.projections.weights
+    projections = prepared.projections
     return replace(
         prepared.of_views(np.setdiff1d(np.arange(prepared.geometry.n_views), held)),
-        held_out=(projections.data[held], prepared.geometry.select(held)),
+        held_out=Views(projections.data, prepared.geometry, projections.weights).select(held),
         held_out_ids=projections.view_ids[held],
-        held_out_weights=None if counted is None else counted[held],
     )

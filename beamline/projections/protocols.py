@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.rules.evidence import ScanEvidence
     from recon.base.geometry import Geometry
-    from recon.prep.correct import Projections
+    from recon.prep.projections import Projections
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,8 @@ from beamline.projections.usable_views import gap_sentence
 from beamline.storage.datasets import HELD
 from beamline.storage.readers.base import ScanSource, read_known
 from beamline.storage.rules.evidence import ScanEvidence
-from recon.prep.correct import Projections, References
+from recon.prep.projections import Projections
+from recon.prep.references import References
 
 BATCH_BYTES = 64 * 2**20  # raw pixels read at a time
 

@@ -27,7 +27,7 @@ from drivers.base.frame import FrameKind
 from recon.base.geometry import Geometry
 from recon.base.views import parse_views
 from recon.prep.align import AxisEstimate
-from recon.prep.correct import Projections
+from recon.prep.projections import Projections
 from recon.voxels.measured_law import measured_law
 
 

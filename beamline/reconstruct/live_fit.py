@@ -39,7 +39,7 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.scan import BEFORE_VIEWS, findings_of
 from drivers.base.clock import Clock
 from recon.base.method import Progress
-from recon.prep.correct import Projections, merge_and_empty
+from recon.prep.projections import Projections, merge_and_empty
 from recon.splatting.stream import StreamingFit
 from recon.splatting.time_limit import FinalFit
 

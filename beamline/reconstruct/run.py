@@ -78,7 +78,7 @@ def without_outside(prepared: PreparedProjections, made: Reconstruction) -> Prep
         some = slice(first, first + _AT_ONCE)
         prepared.projections.data[some] -= made.outside(prepared.geometry.select(some))
     if (held := prepared.held_out) is not None:
-        held = held[0] - made.outside(held[1]), held[1]
+        held = replace(held, data=held.data - made.outside(held.geometry))
     return replace(prepared, held_out=held, inside=True)
 
 

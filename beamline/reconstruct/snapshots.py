@@ -26,7 +26,7 @@ from beamline.storage.writers.recon_file import write_reconstruction
 from drivers.base.clock import Clock
 from recon.base.views import spread
 from recon.base.volume import Volume
-from recon.prep.correct import Projections
+from recon.prep.projections import Projections
 from recon.splatting.anytime import BetterVolume
 from recon.splatting.stream import StreamingFit
 from recon.voxels.direct import Fbp

@@ -91,14 +91,19 @@ def run_scan(
             if series is not None:
                 series.lock.release()  # that of the part keeps others away from here on
             measurement = Measurement(config, instrument, ready, folder, stop, sink, began, series)
-            pause = measurement.pause
-            stack.enter_context(verbs_taken(folder, stop, pause, measurement.decider.answer))
-            guarded = stack.enter_context(ExitStack())  # until the instrument is free for another scan
-            if config.simulation is None:
-                without = pause if config.scan.on_watchdog_loss == "pause" else None
-                guarded.enter_context(watched(folder, sink, stop, without))
+            stack.enter_context(verbs_taken(folder, stop, measurement.pause, measurement.decider.answer))
+            guarded = stack.enter_context(_watched(measurement))  # until the instrument is free for another scan
             guarded.callback(connected.close)
             return _to_its_end(measurement, live, afterwards, guarded.close)
+
+
+def _watched(measurement: Measurement) -> ExitStack:
+    """A watchdog beside the scan of a real instrument, which ends as the stack is closed."""
+    config, guarded = measurement.config, ExitStack()
+    if config.simulation is None:
+        without = measurement.pause if config.scan.on_watchdog_loss == "pause" else None
+        guarded.enter_context(watched(measurement.folder, measurement.sink, measurement.stop, without))
+    return guarded
 
 
 def _announcing(

@@ -203,6 +203,12 @@ class FrameTable:
         return FrameTable(**columns | {"numbers": None, "flags": flags})
 
 
+def kinds_of(image_keys: NDArray[np.integer[Any]]) -> NDArray[np.int32]:
+    """Kinds of frames [frame] by NXtomo's image keys, or the finer ones; codes that nobody defined are INVALID."""
+    known = [kind for kind in FrameKind if kind is not FrameKind.OFFSET_VIEW]  # files tell it by a translation
+    return np.where(np.isin(image_keys, known), image_keys, FrameKind.INVALID).astype(np.int32)
+
+
 _ARRAYS = [each.name for each in fields(FrameTable) if each.name not in ("part_starts", "pass_ends", "flags")]
 
 

@@ -235,8 +235,8 @@ POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
 def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> PoseTable:
     """Translations of the sample, in mm from their median: a common one is no displacement of a view."""
     places = choose(file, find(file))
-    keys = np.ravel(datasets.values_of(places.image_key))
-    shown = keys == FrameKind.PROJECTION
+    kinds = places.kinds()
+    shown = kinds == FrameKind.PROJECTION
     moved: dict[str, F64] = {}
     for axis in "xyz":
         item = datasets.dataset(places.entry, f"sample/{axis}_translation")
@@ -245,12 +245,12 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
         datasets.require_real(item.dtype, f"{item.name} in {path}")
         unit = datasets.factor_of(datasets.attribute(item, "units"), datasets.LENGTH_UNITS)
         values = np.ravel(np.asarray(datasets.values_of(item), np.float64))
-        if unit is None or values.size not in (1, keys.size):
+        if unit is None or values.size not in (1, kinds.size):
             raise _NoPosesError(
                 f"{path}: {item.name} has {values.size} values in the units {datasets.attribute(item, 'units')!r}; "
-                f"expected one for each of {keys.size} frames, in a unit of length"
+                f"expected one for each of {kinds.size} frames, in a unit of length"
             )
-        values = np.broadcast_to(values * unit, keys.shape)
+        values = np.broadcast_to(values * unit, kinds.shape)
         if not np.isfinite(values[shown]).all():
             raise _NoPosesError(
                 f"{path}: {item.name} is not finite in {(~np.isfinite(values[shown])).sum()} projections"
@@ -270,10 +270,10 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
         raise _NoPosesError(
             f"{path}: {','.join(ways)} are not two of the translations there, {', '.join(moved)}; {_HOW}"
         )
-    shifts = [np.zeros(keys.size) if way == "0" else (-1 if way[0] == "-" else 1) * moved[way[-1]] for way in ways]
+    shifts = [np.zeros(kinds.size) if way == "0" else (-1 if way[0] == "-" else 1) * moved[way[-1]] for way in ways]
     rows = np.flatnonzero(shown)
     stacked = np.stack(shifts, axis=1)[rows]
-    return PoseTable(path, "frame", rows.astype(np.float64), None, stacked, np.zeros((rows.size, 2)), "mm", keys.size)
+    return PoseTable(path, "frame", rows.astype(np.float64), None, stacked, np.zeros((rows.size, 2)), "mm", kinds.size)
 
 
 def write_poses(path: Path, volume: Path) -> tuple[int, float]:

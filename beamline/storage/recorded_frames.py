@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.process import json_object
 from beamline.storage import datasets, hdf5
-from beamline.storage.frame_table import FrameTable
+from beamline.storage.frame_table import FrameTable, kinds_of
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 from recon.base.arrays import I64, Mask
@@ -35,8 +35,7 @@ def frames_in(file: h5py.File, n: int | None = None) -> FrameTable:
     """
     n = int(file[layout.COMMITTED][()]) if n is None else n
     columns, aside = _record(file, n), None
-    altered, kinds = _altered(columns), columns[layout.KIND].copy()
-    kinds[~np.isin(kinds, list(FrameKind))] = FrameKind.INVALID
+    altered, kinds = _altered(columns), kinds_of(columns[layout.KIND])
     if layout.X_TRANSLATION in file:
         aside = _column(file, layout.X_TRANSLATION, n)
         kinds[(kinds == FrameKind.ALIGNMENT) & (aside != 0)] = FrameKind.OFFSET_VIEW
@@ -88,11 +87,14 @@ def _list_in(file: h5py.File, path: str) -> Sequence[Any]:
     return file[path][()]
 
 
-def image_key_of(kind: FrameKind) -> int:
-    """NXtomo's image key of a kind of frame. NXtomo has no key for alignment frames: programs that do not know them
-    must not use them. An offset view is a projection, of a translated sample.
+def codes_of(kind: FrameKind) -> dict[str, int]:
+    """The codes of a kind of frame, by their columns: NXtomo's image key, and the finer one of the log.
+
+    NXtomo has no key for alignment frames: programs that do not know them must not use them. An offset view is a
+    projection, of a translated sample; the log has it as an alignment frame.
     """
-    return int({FrameKind.ALIGNMENT: FrameKind.INVALID, FrameKind.OFFSET_VIEW: FrameKind.PROJECTION}.get(kind, kind))
+    key = {FrameKind.ALIGNMENT: FrameKind.INVALID, FrameKind.OFFSET_VIEW: FrameKind.PROJECTION}.get(kind, kind)
+    return {layout.IMAGE_KEY: int(key), layout.KIND: max(int(kind), int(FrameKind.ALIGNMENT))}
 
 
 def record_checksums(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint32]:
@@ -136,10 +138,9 @@ def _altered(columns: Mapping[str, NDArray[Any]]) -> Mask:
     """Whether each row differs from its checksum."""
     checksums = columns[layout.RECORD_CHECKSUM]
     good = np.asarray(record_checksums(columns) == checksums)
-    marked = ~good & ((columns[layout.KIND] == FrameKind.INVALID) | (columns[layout.IMAGE_KEY] == FrameKind.INVALID))
+    marked = ~good & np.any([columns[path] == code for path, code in codes_of(FrameKind.INVALID).items()], axis=0)
     for kind in FrameKind if marked.any() else ():  # as of a repeated frame, whose checksum is that of its kind
-        codes = {layout.IMAGE_KEY: image_key_of(kind), layout.KIND: int(kind)}
-        before = {path: np.full_like(columns[path], code) for path, code in codes.items()}
+        before = {path: np.full_like(columns[path], code) for path, code in codes_of(kind).items()}
         good[marked] |= (record_checksums({**columns, **before}) == checksums)[marked]
     return ~good
 

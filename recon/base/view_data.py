@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.base.arrays import F32, bin_views
+from recon.base.arrays import F32, Mask, bin_views
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.masks import masked
@@ -47,6 +47,11 @@ class Views:
         data, weights = masked(self.data, self.weights)
         return self if data is self.data and weights is self.weights else replace(self, data=data, weights=weights)
 
+    def weighed(self, factor: F32 | Mask) -> Views:
+        """The views with the weights of rays times a factor, of a shape that goes with [view, row, col]."""
+        ones = np.broadcast_to(np.float32(1), self.data.shape) if self.weights is None else self.weights
+        return replace(self, weights=np.multiply(ones, factor, dtype=np.float32))
+
     def binned(self, factor: int, geometry: Geometry | None = None) -> Views:
         """Views with factor x factor pixels joined: their weighted means, with their mean weight.
 
@@ -67,8 +72,14 @@ class Views:
         return self.select(seen), self.select(unseen)
 
 
-def split_views(geometry: Geometry, one_in: int = ONE_IN) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Views to reconstruct from, and one in `one_in` held out, evenly spread in angle."""
-    order = np.argsort(np.mod(geometry.angles, geometry.period), kind="stable")
+def split_views(
+    geometry: Geometry, one_in: int = ONE_IN, period: float | None = None
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Views to reconstruct from, and one in `one_in` held out, evenly spread in angle.
+
+    Args:
+        period: radians after which angles are the same; None: that of the geometry, which depends on the axis.
+    """
+    order = np.argsort(np.mod(geometry.angles, period or geometry.period), kind="stable")
     unseen = np.sort(order[one_in // 2 :: one_in])
     return np.setdiff1d(np.arange(geometry.n_views), unseen), unseen

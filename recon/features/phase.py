@@ -13,6 +13,7 @@ from scipy import fft
 from recon.base.arrays import F32, F64
 from recon.base.geometry import Geometry
 from recon.base.units import HC
+from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid
 from recon.voxels.choice import exceeds_standard_error, preferred_strength
@@ -140,12 +141,13 @@ def length_by_held_out_views(
     if matter := columns_of_matter(geometry, Grid.matching(geometry), views):
         views, known, geometry = views[:, :, matter[0]], known[:, matter[0]], matter[1]
     method, grid = FistaTv(_SWEEPS, _TV_WEIGHT), Grid.matching(geometry)
+    weights = None if known.all() else np.broadcast_to(known.astype(np.float32), views.shape)
 
     @cache
     def residuals_of(square: float) -> F64:
         filtered = views.copy()
         Paganin(math.sqrt(square)).retrieve(filtered, floor)
-        unseen, images = predicted_views(method, filtered, geometry, grid, None if known.all() else known, _ONE_IN)
+        unseen, images = predicted_views(method, Views(filtered, geometry, weights), grid, _ONE_IN)
         fringes = (1 + (2 * math.pi) ** 2 * square * _squared_frequencies(views)).astype(np.float32)
         off = np.stack([_filtered_light(image, fringes) for image in images]) - np.exp(-views[unseen])
         return np.sqrt(np.square(off[:, known]).mean(axis=1, dtype=np.float64))

@@ -18,7 +18,7 @@ from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from recon.base.arrays import F32, median_deviation
 from recon.base.choices import Rings
 from recon.base.declared_types import check_arguments
-from recon.base.noise import AT_AXIS, NARROWEST, steadiness, without_layers
+from recon.base.stripes import AT_AXIS, NARROWEST, steadiness, without_layers
 from recon.base.units import warn_of_other_quantity
 
 _ROBUST = 1.4826  # as 1 / MEDIAN, rounded: volumes that were recorded have it in what `by_sorting` takes off

@@ -17,13 +17,13 @@ from recon.base.decisions import Decisions, GoesOn
 from recon.base.empirical import FEW_WILD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, RunControl
-from recon.base.noise import ring_offsets
+from recon.base.stripes import ring_offsets
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
-from recon.voxels.iterative import TrialWatch, Watch, solve
+from recon.voxels.iterative import TrialWatch, Watch, solve_views
 from recon.voxels.methods import PnpDct
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
 from recon.voxels.projector import Projector
@@ -144,7 +144,8 @@ def finish(
     projector = Projector(problem.geometry, volume.grid, device=problem.device)
     decide = control.decide or Decisions(problem.seed)
     beyond = beyond_voxels(gaussians, problem.geometry, volume.grid, fit)
-    data = prepared.data if beyond is None else prepared.data - beyond
+    if beyond is not None:
+        prepared = replace(prepared, data=prepared.data - beyond)
     n_views, count, made, begin = problem.geometry.n_views, sweeps or FINISH_SWEEPS, 0, control.now()
     method = _Finish(count, sweeps is None)
 
@@ -154,8 +155,8 @@ def finish(
         control.report_progress(number, method.planned, begin, n_views, "sweeps on voxels")
         return control.stop()
 
-    refined = solve(
-        method, projector, data, weight=prepared.weights, start=start, nonnegative=nonnegative,
+    refined = solve_views(
+        method, projector, prepared, start=start, nonnegative=nonnegative,
         watch=Watch(on_sweep, TrialWatch(control, n_views, PnpDct().trial_sweeps)), decide=decide,
     )  # fmt: skip
     return Finished(refined, min(count, made))
@@ -179,5 +180,4 @@ def _without_outliers(views: Views, model: F32) -> Views:
     wild = np.abs(views.data - model) > WILD_RAY * float(model.max())
     if not 0 < np.count_nonzero(wild) < FEW_WILD * wild.size:
         return views
-    kept = np.where(wild, np.float32(0), np.float32(1) if (rays := views.weights) is None else rays)
-    return replace(views, weights=kept).masked()
+    return views.weighed(~wild).masked()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +9,7 @@ from recon.base.arrays import F32
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, RunControl
-from recon.base.view_data import Views
+from recon.base.view_data import Views, split_views
 from recon.base.volume import Grid
 from recon.voxels.choice import TRIALS
 from recon.voxels.projector import Projector
@@ -35,21 +33,11 @@ def choice_sweeps(geometry: Geometry) -> float:
     return CHOICE_SWEEPS * share if geometry.n_views >= LEAST_VIEWS else 0.0
 
 
-def predicted_views(
-    method: Method, data: F32, geometry: Geometry, grid: Grid, known: NDArray[Any] | None, one_in: int
-) -> tuple[NDArray[np.intp], F32]:
-    """Numbers of the held-out views, one in `one_in` by angle, and their images [view, row, col] predicted by the
-    others.
+def predicted_views(method: Method, views: Views, grid: Grid, one_in: int) -> tuple[NDArray[np.intp], F32]:
+    """Numbers of the held-out views, and their images [view, row, col] predicted by a volume of the others.
 
-    Args:
-        method: that makes the volume.
-        data: line integrals [view, row, col].
-        known: [row, col] or [view, row, col] weights of pixels; None: one for all.
+    They are those of `split_views`, but for a turn whatever the axis: geometries are compared by the same views.
     """
-    order = np.argsort(np.mod(geometry.angles, 2 * np.pi), kind="stable")
-    unseen = order[1::one_in]
-    seen = np.setdiff1d(order, unseen)
-    weights = None if known is None else np.broadcast_to(known, data.shape)[seen].astype(np.float32)
-    views = Views(data[seen], geometry.select(seen), weights)
-    volume = method.run(ReconProblem(views, grid), RunControl()).volume
-    return unseen, Projector(geometry.select(unseen), grid).forward(volume.data)
+    seen, unseen = split_views(views.geometry, one_in, 2 * np.pi)
+    volume = method.run(ReconProblem(views.select(seen), grid), RunControl()).volume
+    return unseen, Projector(views.geometry.select(unseen), grid).forward(volume.data)

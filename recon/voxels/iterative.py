@@ -25,6 +25,7 @@ from recon.base.geometry import Geometry, require_views
 from recon.base.method import SWEEPS_OF_TRIALS, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Iterative
 from recon.base.setting import Count
+from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.voxels.choice import MOST_TRIALS
 from recon.voxels.projector import Projector, projection_lines, volume_lines, volume_slices
@@ -114,7 +115,22 @@ def solve(
         ValueError: for shapes that disagree, values that are not finite, weights below zero or all zero, projections
             that are zero everywhere.
     """
-    problem, lines = scaled_problem(projector, projections, weight, start, nonnegative, watch, decide or Decisions())
+    views = Views(projections, projector.geometry, weight)
+    return solve_views(method, projector, views, start=start, nonnegative=nonnegative, watch=watch, decide=decide)
+
+
+def solve_views(
+    method: Iterating,
+    projector: Projector,
+    views: Views,
+    *,
+    start: Volume | None = None,
+    nonnegative: bool = True,
+    watch: Watch = _UNWATCHED,
+    decide: Decisions | None = None,
+) -> Volume:
+    """`solve` of views in the projector's geometry, with their weights; arguments and errors are the same."""
+    problem, lines = scaled_problem(projector, views, start, nonnegative, watch, decide or Decisions())
     with threads_for(projector.grid):
         found = method.iterate(problem, lines)
     return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
@@ -133,11 +149,10 @@ def threads_for(grid: Grid) -> Iterator[None]:
 
 
 def scaled_problem(
-    projector: Projector, projections: F32, weight: F32 | None, start: Volume | None, nonnegative: bool, watch: Watch,
-    decide: Decisions,
-) -> tuple[VoxelProblem, F32]:  # fmt: skip
+    projector: Projector, views: Views, start: Volume | None, nonnegative: bool, watch: Watch, decide: Decisions
+) -> tuple[VoxelProblem, F32]:
     """The problem of these views in units of about one, and the first volume [y, x, z]; arguments as of `solve`."""
-    data, rays = _checked(projector, projections, weight)
+    data, rays = _checked(projector, views.data, views.weights)
     lines = _start(projector, start)
     units = Units(*decide(UNITS, lambda: Units.of(projector, data, rays)))
     times_power(data, -units.integral)
@@ -192,13 +207,12 @@ class VoxelMethod(Iterative):
             control.tell(history[-1])
             return control.stop()
 
-        given = problem.views.masked()
         decide, settings = control.decide or Decisions(problem.seed), asdict(self)
         watch = Watch(report, TrialWatch(control, views, self.trial_sweeps))
-        volume = solve(
-            self, Projector(problem.geometry, problem.grid, device=problem.device), given.data, weight=given.weights,
-            nonnegative=not self.allow_negative, watch=watch, decide=decide,
-        )  # fmt: skip
+        projector = Projector(problem.geometry, problem.grid, device=problem.device)
+        volume = solve_views(
+            self, projector, problem.views.masked(), nonnegative=not self.allow_negative, watch=watch, decide=decide
+        )
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
         return Reconstruction(volume, {**settings, **chosen, "seed": problem.seed}, tuple(history))
 

@@ -12,8 +12,9 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 
 from recon.base.arrays import F32, Mask, bin_views
 from recon.base.geometry import Geometry
-from recon.base.noise import air_level, noise_level, ring_offsets
+from recon.base.noise import air_level, noise_level
 from recon.base.slabs import part_of
+from recon.base.stripes import ring_offsets
 from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid, Volume

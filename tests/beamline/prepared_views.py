@@ -14,7 +14,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from recon.base.geometry import Geometry
-from recon.prep.correct import Projections
+from recon.prep.projections import Projections
 
 
 def prepare(

@@ -172,7 +172,7 @@ def _spied(module: str, found: dict[str, str]) -> Any:
         found["line integrals"] = _digest(views.data)
         found["views"] = _digest(views.view_ids, geometry.angles, geometry.shifts, np.float64(geometry.axis_col))
         found["weights"] = "" if weights is None else _digest(weights)
-        found["held out"] = "" if prepared.held_out is None else _digest(prepared.held_out[0])
+        found["held out"] = "" if prepared.held_out is None else _digest(prepared.held_out.data)
         return write(made, prepared, *rest, **named)
 
     return patch(f"{module}.write_result", noted)

@@ -32,6 +32,7 @@ from recon.base.empirical import ONE_IN
 from recon.base.volume import Grid, Volume
 from recon.methods import BASELINE
 from recon.voxels.choice import Prediction, TrialChoice
+from recon.voxels.held_out import TRIAL_ROWS
 from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.residuals import squares_left
 from recon.voxels.resolution import ViewResolution
@@ -43,7 +44,6 @@ _OTHER_VIEWS = (
     "These values change the views that judge the slices: each is compared with the views of every value, which "
     "favours the middle of a range. Look at the pictures first."
 )
-_TALLEST = 16  # rows of a slab around the slice, as of trials of a method
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
     Raises:
         ConfigError, DataError: a scan or a selection that is refused.
     """
-    halo = max(min(trial.method.halo, (_TALLEST - 1) // 2) for trial in trials)
+    halo = max(min(trial.method.halo, (TRIAL_ROWS - 1) // 2) for trial in trials)
     return [replace(trial, selection=_middle(trial, halo)) for trial in trials]
 
 
@@ -162,7 +162,7 @@ class SweptScan(TrialScan):
         """The residual of the views held out, as this trial corrects them, and its square in each."""
         used = self._used
         assert used is not None and used.held_out is not None and used.held_out_ids is not None and self._views
-        projector, data = Projector(used.held_out[1], made.grid), used.held_out[0]
+        projector, data = Projector(used.held_out.geometry, made.grid), used.held_out.data
         data = data if used.measured is None else np.where(used.measured, data, np.float32(np.nan))
         model = projector.forward(np.asarray(made.data))
         unseen = UnseenViews(
@@ -218,14 +218,13 @@ def middle_axis(selections: Sequence[Selection]) -> float | None:
 def _about(prepared: PreparedProjections, selection: Selection) -> PreparedProjections:
     """The same views about the axis of the selection."""
     assert prepared.held_out is not None and selection.axis_col is not None
-    data, unseen = prepared.held_out
-    n = selection.binning
+    unseen, n = prepared.held_out, selection.binning
     axis_col = (selection.axis_col - (n - 1) / 2) / n
     return replace(
         prepared,
         geometry=replace(prepared.geometry, axis_col=axis_col),
         axis_col=selection.axis_col,
-        held_out=(data, replace(unseen, axis_col=axis_col)),
+        held_out=replace(unseen, geometry=replace(unseen.geometry, axis_col=axis_col)),
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from beamline.core.errors import DataError
 from beamline.projections.step import StepDone, StepMemory, option
 from recon.base.arrays import F32, F64, Mask, bin_views, factor_within
+from recon.base.view_data import Views
 from recon.base.views import spread
 from recon.base.volume import Grid
 
@@ -82,7 +83,7 @@ class Air:
 
     @property
     def columns(self) -> Columns:
-        """The (left, right) columns of air, as in `recon.prep.correct.CorrectionSettings`."""
+        """The (left, right) columns of air, as in `recon.prep.counts_plan.CorrectionSettings`."""
         return _parts(self.model)[0]
 
     @property
@@ -161,7 +162,7 @@ def without_background(
     data: F32,
     geometry: Geometry,
     surface: Surface,
-    others: tuple[F32, Geometry] | None = None,
+    others: Views | None = None,
     unknown: Mask | None = None,
     levelled: float = 0.0,
 ) -> tuple[str, F64 | None]:
@@ -171,7 +172,7 @@ def without_background(
 
     Args:
         surface: "auto": where the views confirm it; a number: polynomials of this order.
-        others: further views and their geometry, which lose their background, too.
+        others: further views, which lose their background, too.
         unknown: bool [row, col], pixels that were not measured.
         levelled: line integral of the air at the edges that was taken off already, the mean of the views.
 
@@ -204,7 +205,7 @@ def without_background(
             f"surface is not taken off. If that is air, give --air surface:{fitted.order}."
         ), None
     if others is not None:
-        more = _Views(*others, unknown)
+        more = _Views(others.data, others.geometry, unknown)
         unseen = more.sums(*where, np.arange(len(more.data))).fit(fitted.order)
         if unseen is not None:
             unseen.remove(more.data)

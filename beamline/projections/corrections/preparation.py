@@ -27,7 +27,7 @@ class Preparation:
             of their changes that the view shows, see `recon.prep.dynamic_flats`.
         ring_current: "use": views and flats are divided by the ring current that the file has for each frame.
         floor, hot_threshold, zinger_threshold: which pixels are taken from their neighbours, see
-            `recon.prep.correct.CorrectionSettings`.
+            `recon.prep.counts_plan.CorrectionSettings`.
     """
 
     name: ClassVar[str] = "preparation"

@@ -18,9 +18,8 @@ from beamline.projections.read import read_binned, spoilt_frames
 from beamline.projections.selection import ScanSelection
 from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
-from recon.prep.correct import References
 from recon.prep.dynamic_flats import find_dynamic_flats
-from recon.prep.references import dark_at, dead_pixels
+from recon.prep.references import References, dark_at, dead_pixels
 from recon.prep.spots import without_spots
 
 _STEADY = 0.01  # of the ring current: top-up keeps it so

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from beamline.storage.readers.base import ScanSource
     from beamline.storage.rules.evidence import ScanEvidence
     from recon.prep import resample
-    from recon.prep.correct import Projections
+    from recon.prep.projections import Projections
 
 _MOST_TILT_DEG = 45.0
 _BANDS, _BAND_ROWS, _VIEWS = 16, 4, 240  # bands of rows, rows of each, and views that --tilt auto measures
@@ -152,10 +152,9 @@ class TiltAndLens:
 
 def with_tilt(
     scan: ScanEvidence, selection: ScanSelection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
-) -> tuple[ScanSelection, str]:
-    """The selection with the tilt found from all detector rows, if it asks for that; and a sentence about it.
-
-    The sentence is empty where the tilt was not asked for.
+) -> tuple[ScanSelection, dict[str, StepDone]]:
+    """The selection with the tilt found from all detector rows, if it asks for that; and what was done, by the name of
+    the step, where it does.
 
     Args:
         frames: views that may be used.
@@ -173,7 +172,7 @@ def with_tilt(
     source = scan.source
     step.of(source, selection)  # refuses a cone
     if not step.sought:
-        return selection, ""
+        return selection, {}
     rows, frames = source.shape[0] // selection.binning, spread_views(source.table.angles[frames], _VIEWS, frames)
     try:
         tilt, uncertainty = _refined(scan, replace(selection, rows=None), frames, progress)
@@ -189,9 +188,10 @@ def with_tilt(
     lean = f"The axis leans by {tilt_text(tilt, uncertainty)}, {abs(tilt) * rows:.2g} px over {rows} rows"
     if uncertainty * rows > MATTERS:
         warn(f"{lean}: this is not sure to half a pixel. Check the first and the last slices for doubled edges.")
-    if abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING:
-        return selection.with_steps(replace(step, tilt=0.0)), f"{lean}: not corrected."
-    return selection.with_steps(replace(step, tilt=math.degrees(tilt))), f"{lean}; views are turned."
+    straight = abs(tilt) < 2 * uncertainty or abs(tilt) * rows < _NOTHING
+    step = replace(step, tilt=0.0 if straight else math.degrees(tilt))
+    done = step.done(f"{lean}: not corrected." if straight else f"{lean}; views are turned.")
+    return selection.with_steps(step), {step.name: done}
 
 
 def _search_memory(source: ScanSource, selection: ScanSelection) -> int:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 from beamline.storage import datasets
+from beamline.storage.frame_table import kinds_of
 from beamline.storage.readers.orders import order_of_axes
 
 _LISTED = 6  # detectors, or lists of angles, that a sentence names
@@ -34,6 +35,15 @@ class Places:
     angle: h5py.Dataset | None
     angle_problem: str
     sense: int = 1
+
+    @property
+    def keys(self) -> h5py.Dataset:
+        """The codes of the kinds of frames; of two lists that which has alignment frames, too."""
+        return datasets.dataset(self.detector, "image_key_control") or self.image_key
+
+    def kinds(self) -> NDArray[np.int32]:
+        """The kinds of all frames."""
+        return kinds_of(np.ravel(datasets.values_of(self.keys)))
 
 
 def find(file: h5py.File) -> list[Places]:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from beamline.core.errors import DataError
 from beamline.storage import datasets, hdf5
 from beamline.storage.datasets import require_real
-from beamline.storage.frame_table import FrameTable
+from beamline.storage.frame_table import FrameTable, kinds_of
 from beamline.storage.readers.base import WHOLE, NotUsed, Quantity, ScanSource, frame_indices
 from beamline.storage.readers.fields import NXTOMO, UPRIGHT, stated_in
 from beamline.storage.readers.nexus import (
@@ -33,7 +33,6 @@ from beamline.storage.readers.nexus import (
 from beamline.storage.structure import drawn_on
 from beamline.storage.superblock import marked_as_being_written
 from beamline.storage.writers import layout
-from drivers.base.frame import FrameKind
 from recon.base.arrays import Mask
 
 _S = TypeVar("_S", bound="NexusSource")
@@ -103,13 +102,11 @@ class NexusSource(ScanSource):
         return mask[:: -1 if upside_down else 1, :: -1 if left_to_right else 1]
 
     def _check(self) -> None:
-        finer = datasets.dataset(self._places.detector, "image_key_control")
-        for item in (self._places.data, self._places.image_key, finer):
-            if item is not None:
-                require_real(item.dtype, f"{item.name} in {self.path}")
+        for item in (self._places.data, self._places.keys):
+            require_real(item.dtype, f"{item.name} in {self.path}")
         self.unpack_bytes = datasets.require_possible(self._places.data)
         require_order(self._places)
-        lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.image_key)
+        lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.keys)
         if lost:
             raise DataError(
                 f"{self.path} draws its frames from {lost[0]}, which is not there or differs ({len(lost)} such)."
@@ -121,26 +118,25 @@ class NexusSource(ScanSource):
 
     @guarded
     def refresh(self) -> int:
-        places, ended = self._places, self.finished
-        key = datasets.dataset(places.detector, "image_key_control") or places.image_key
-        hdf5.look_again(key)
+        places, keys, ended = self._places, self._places.keys, self.finished
+        hdf5.look_again(keys)
         angle = places.angle if self._own_angles else None
         there = [hdf5.n_written(each) for each in (places.data, angle) if each is not None]
-        n = len(places.data) if ended else min(*there, len(key))
+        n = len(places.data) if ended else min(*there, len(keys))
         angles = np.full(n, np.nan) if angle is None else places.sense * datasets.radians(angle) + 0.0  # no -0
-        keys = np.ravel(datasets.values_of(key))
-        sizes = (int(places.data.shape[0]), keys.size, angles.size)
+        kinds = kinds_of(np.ravel(datasets.values_of(keys)))
+        sizes = (int(places.data.shape[0]), kinds.size, angles.size)
         if min(sizes) < n or (ended and max(sizes) > n):
             raise DataError(
                 f"{self.path}: {sizes[0]} frames, {sizes[1]} image keys and {sizes[2]} angles; expected {n} of each."
             )
-        self.n, written = n, [kind for kind in FrameKind if kind is not FrameKind.OFFSET_VIEW]
+        self.n = n
         seconds, times = self._seconds(places.detector, "count_time"), self._seconds(places.entry, "frame_log/time")
         exposures = np.where(seconds > 0, seconds, np.nan)  # some write 0 for what they do not know
         logged = {f"{name}s": self._column(f"frame_log/{name}") for name in ("trigger", "framestamp")}
         own = {name: column for name, column in logged.items() if column is not None}
         self.table = FrameTable.of(
-            np.where(np.isin(keys[:n], written), keys[:n], FrameKind.INVALID),
+            kinds[:n],
             angles[:n],
             exposures,
             times=times if np.isfinite(times).any() else None,

@@ -143,8 +143,7 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     if dataset:
         return _read(path, dataset_at(file, dataset))
     for places in find(file):
-        keys = np.ravel(datasets.values_of(places.image_key))
-        if (keys == kind).any():
+        if (places.kinds() == kind).any():
             return _of_scan(open_nxtomo(path, own_angles=False, data=str(places.data.name)), kind)
     exchange = datasets.dataset(file, _EXCHANGE[kind])
     if exchange is not None and datasets.dataset(file, "exchange/data") is not None:

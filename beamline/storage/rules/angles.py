@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.storage.rules import Finding, Severity
+from beamline.storage.rules import Finding
 from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.units import gone_round, look_like_degrees
 
@@ -18,7 +18,7 @@ _EQUAL, _FEW = 1e-3, 4  # degrees between views of one direction; columns of the
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
-_MANY = 30  # views from which on a span tells that it is in no degrees
+_MANY = 30  # views: fewer within 6.28 degrees may be a trial scan, and are not refused as radians
 
 
 def angles_unknown(scan: ScanEvidence) -> str:
@@ -52,31 +52,9 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
         return
     step = span / (distinct.size - 1)
-    # A plan is of our own scans, whose angles are in degrees.
-    severity: Severity = "warning" if scan.source.plan else "error"
-    between = float(np.median(np.abs(np.diff(degrees))))
-    if look_like_degrees(angles):
-        yield Finding(
-            severity,
-            "angle-spread",
-            f"{angles.size} projections span {span / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: these look "
-            "like degrees under a label of radians. If so, give them with --angles FILE (degrees, one a line).",
-        )
-    elif between >= 360:
-        yield Finding(
-            severity,
-            "angle-spread",
-            f"The projections go from {degrees.min():.6g} to {degrees.max():.6g} degrees, {between:.4g} from one to "
-            "the next, which is a turn or more: these look like counts of an encoder or of steps. Give them in "
-            "degrees with --angles FILE (one a line); if they are right, give them less whole turns.",
-        )
-    elif (unit := _smaller_unit(distinct, angles.size)) is not None:
-        yield Finding(
-            severity,
-            "angle-spread",
-            f"{angles.size} projections span only {span:.4g} degrees: {unit} Give them in degrees with --angles FILE "
-            "(one a line), or say --angles-unit rad with it.",
-        )
+    if (text := _no_degrees(angles, distinct)) is not None:
+        # A plan is of our own scans, whose angles are in degrees.
+        yield Finding("warning" if scan.source.plan else "error", "angle-spread", text)
     elif (unseen := half_turn_unseen(angles)) > 0:
         span_text = (
             f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
@@ -123,6 +101,33 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
     if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
         limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
     return float(largest) if largest > limit else 0.0
+
+
+def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> str | None:
+    """What shows that angles [view], in rad as they were read, were not in degrees; None where they may have been.
+
+    Args:
+        distinct: the same in degrees, each once and ascending.
+    """
+    between = float(np.median(np.abs(np.diff(np.degrees(angles)))))
+    if look_like_degrees(angles):
+        return (
+            f"{angles.size} projections span {np.ptp(distinct) / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: "
+            "these look like degrees under a label of radians. If so, give them with --angles FILE (degrees, one a "
+            "line)."
+        )
+    if between >= 360:
+        return (
+            f"The projections go from {distinct[0]:.6g} to {distinct[-1]:.6g} degrees, {between:.4g} from one to "
+            "the next, which is a turn or more: these look like counts of an encoder or of steps. Give them in "
+            "degrees with --angles FILE (one a line); if they are right, give them less whole turns."
+        )
+    if (unit := _smaller_unit(distinct, angles.size)) is not None:
+        return (
+            f"{angles.size} projections span only {np.ptp(distinct):.4g} degrees: {unit} Give them in degrees with "
+            "--angles FILE (one a line), or say --angles-unit rad with it."
+        )
+    return None
 
 
 def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:

@@ -25,7 +25,7 @@ from beamline.monitor.checks import ALARMS
 from beamline.monitor.digest import FrameDigest
 from beamline.storage import datasets, hdf5
 from beamline.storage.flag_legend import FLAGS, REGIONS, SCORES, UNMARKED, VALID, Mark
-from beamline.storage.recorded_frames import frames_in, image_key_of, record_checksums
+from beamline.storage.recorded_frames import codes_of, frames_in, record_checksums
 from beamline.storage.writers import layout
 from drivers.base.frame import Frame, FrameKind
 from recon.base.arrays import I64
@@ -57,8 +57,7 @@ class Rows:
             self.flush()
             self._first = row
         values = {
-            layout.IMAGE_KEY: image_key_of(frame.kind),
-            layout.KIND: max(int(frame.kind), int(FrameKind.ALIGNMENT)),
+            **codes_of(frame.kind),
             layout.X_TRANSLATION: frame.aside,
             layout.COUNT_TIME: frame.exposure,
             layout.ANGLE: math.degrees(frame.angle),
@@ -78,8 +77,8 @@ class Rows:
         self._said.append({path: values[path] for path in self._columns})
         if frame.replaces >= 0:
             self.flush()
-            for path in (layout.IMAGE_KEY, layout.KIND):
-                self._columns[path][frame.replaces] = int(FrameKind.INVALID)
+            for path, code in codes_of(FrameKind.INVALID).items():
+                self._columns[path][frame.replaces] = code
 
     def flush(self) -> None:
         """Write the metadata of the rows since the last call. The caller then flushes the file."""

@@ -1,7 +1,7 @@
 """Gains of pixels, learnt with the volume: a constant of each pixel in all views, which makes a ring.
 
 A few sweeps of FISTA-TV and the median of the residual over the views alternate, see `ring_offsets`. Total variation
-keeps rings out of the volume, and bodies in it. Without stripes, see `recon.base.noise`, nothing is learnt:
+keeps rings out of the volume, and bodies in it. Without stripes, see `recon.base.stripes`, nothing is learnt:
 what few sweeps leave at edges would count as gains. Three sorts of gain stay in the views. A gain near the axis looks
 like a body on the axis. What pixels on both sides of the axis have in common looks like the wall of a can. A slow
 change along a row looks like density.
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32, F64, Mask
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
-from recon.base.noise import AT_AXIS, NARROWEST, ring_offsets, steadiness
+from recon.base.stripes import AT_AXIS, NARROWEST, ring_offsets, steadiness
 from recon.base.view_data import split_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.choice import exceeds_standard_error

@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, F64, bin_views
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from recon.base.volume import Grid
 from recon.features.calibration.joint import TERMS, GeometryChange, JointFit, edge_motion, taller
 from recon.voxels.choice import exceeds_standard_error
@@ -50,7 +51,8 @@ class Judge:
     def deviations(self, geometry: Geometry) -> F64:
         """[held-out view] root mean square residual of a volume from the other views in this geometry."""
         method, rows = FistaTv(_SWEEPS, _TV_WEIGHT), geometry.detector_shape[0]
-        unseen, images = predicted_views(method, self.views, geometry, self.grid, self.known, _ONE_IN)
+        weights = None if self.known is None else np.broadcast_to(self.known, self.views.shape)
+        unseen, images = predicted_views(method, Views(self.views, geometry, weights), self.grid, _ONE_IN)
         known = np.ones(images.shape[1:], np.float32) if self.known is None else self.known.copy()
         edge = min(_EDGE, (rows - 1) // 4)
         known[:edge], known[rows - edge :] = 0, 0

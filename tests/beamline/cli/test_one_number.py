@@ -37,8 +37,8 @@ def test_the_residual_of_views_held_out_of_recon_sweep_and_tradeoff(folder: Path
     volume = Volume(direct(prepared.projections.data, prepared.geometry, grid, "hann"), grid)
     by_recon = judge(volume, prepared.views, held_out=prepared.views_held_out).figures["residual_held_out"]
     assert prepared.held_out is not None and prepared.held_out_ids is not None
-    projector, ids = Projector(prepared.held_out[1], grid), prepared.held_out_ids
-    model, data = (projection_lines(each) for each in (projector.forward(volume.data), prepared.held_out[0]))
+    projector, ids = Projector(prepared.held_out.geometry, grid), prepared.held_out_ids
+    model, data = (projection_lines(each) for each in (projector.forward(volume.data), prepared.held_out.data))
     scores = sweep.scores_of({"a 1": sweep.UnseenViews(ids, data, model, projector.resolution, "")})
     assert scores is not None
     by_tradeoff, _ = trials.TrialData(prepared).measured(trial, volume)

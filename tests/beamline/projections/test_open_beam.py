@@ -99,15 +99,16 @@ def test_weights_follow_the_views_and_pixels_that_are_left() -> None:
     left = held.ray_weights(3)
     assert weights is not None and left is not None and held.projections.weights is not None
     assert left.shape == (len(EXACT) - 5 + 3, *SCAN.shape)
-    assert held.held_out is not None and len(held.held_out[0]) == 5 and (left[-3:] == 1).all()  # other views than held
+    assert held.held_out is not None and len(held.held_out.data) == 5
+    assert (left[-3:] == 1).all()  # other views than held
     alike = held.ray_weights(5)
     assert alike is not None
     apart = np.setdiff1d(np.arange(len(EXACT)), held.projections.view_ids - prepared.projections.view_ids[0])
     both = np.concatenate((np.delete(weights, apart, 0), weights[apart]))
     np.testing.assert_allclose(alike / alike.mean(), both / both.mean(), rtol=1e-5)
-    rows = held.of_rows(slice(2, 6), held.geometry.rows(2, 6)).held_out_weights
-    assert rows is not None and held.held_out_weights is not None
-    np.testing.assert_array_equal(rows, held.held_out_weights[:, 2:6])
+    rows = held.of_rows(slice(2, 6), held.geometry.rows(2, 6)).held_out
+    assert rows is not None and rows.weights is not None and held.held_out.weights is not None
+    np.testing.assert_array_equal(rows.weights, held.held_out.weights[:, 2:6])
 
 
 def test_one_flat_does_not_tell_the_gain() -> None:

@@ -78,7 +78,7 @@ def test_selected_views_and_views_held_out(tmp_path: Path) -> None:
     assert prepared.n_projections == 45
     np.testing.assert_array_equal(prepared.projections.view_ids, np.arange(4, 14))  # 2 darks and 2 flats come first
     assert prepared.held_out is not None
-    data, geometry = prepared.held_out
+    data, geometry = prepared.held_out.data, prepared.held_out.geometry
     assert data.shape == (16, 4, 40)
     assert geometry.angles.min() >= SCAN.angles[10]
     np.testing.assert_allclose(data, replace(SCAN, angles=geometry.angles).line_integrals(), atol=1e-4)

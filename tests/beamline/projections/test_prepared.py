@@ -29,8 +29,8 @@ def test_every_tenth_view_is_held_out_where_all_were_chosen() -> None:
     everything = _prepared("all")
     kept = _every_tenth(everything)
     assert kept.held_out is not None
-    np.testing.assert_allclose(np.degrees(kept.held_out[1].angles), [30, 90, 150])
-    np.testing.assert_array_equal(kept.held_out[0], everything.projections.data[[5, 15, 25]])
+    np.testing.assert_allclose(np.degrees(kept.held_out.geometry.angles), [30, 90, 150])
+    np.testing.assert_array_equal(kept.held_out.data, everything.projections.data[[5, 15, 25]])
     rest = np.setdiff1d(np.arange(30), [5, 15, 25])
     np.testing.assert_array_equal(kept.projections.data, everything.projections.data[rest])
     np.testing.assert_array_equal(kept.projections.view_ids, everything.projections.view_ids[rest])
@@ -47,22 +47,22 @@ def test_a_selection_that_left_some_out_is_not_cut_further() -> None:
 def test_few_views_still_leave_one(n: int) -> None:
     kept = _every_tenth(_prepared("all", np.linspace(0, 3, n)))
     assert kept.held_out is not None
-    assert (kept.geometry.n_views, kept.held_out[1].n_views) == (n - 1, 1)
+    assert (kept.geometry.n_views, kept.held_out.geometry.n_views) == (n - 1, 1)
 
 
 def test_no_more_than_the_most_are_held_out_and_neither_the_first_nor_the_last() -> None:
     held = hold_out(_prepared("all"), 2, most=4, advice="").held_out
     assert held is not None
-    np.testing.assert_allclose(np.degrees(held[1].angles), [18, 66, 108, 156])
+    np.testing.assert_allclose(np.degrees(held.geometry.angles), [18, 66, 108, 156])
 
 
 def test_one_set_for_the_reconstructor() -> None:
     prepared = _prepared("fixed:20")
     assert prepared.held_out is not None
     data, geometry, unseen = with_held_out(prepared.projections.data, prepared.geometry, prepared.held_out)
-    assert unseen == list(range(20, geometry.n_views)) and len(unseen) == prepared.held_out[1].n_views
-    np.testing.assert_array_equal(data[unseen], prepared.held_out[0])
-    np.testing.assert_array_equal(geometry.select(unseen).angles, prepared.held_out[1].angles)
+    assert unseen == list(range(20, geometry.n_views)) and len(unseen) == prepared.held_out.geometry.n_views
+    np.testing.assert_array_equal(data[unseen], prepared.held_out.data)
+    np.testing.assert_array_equal(geometry.select(unseen).angles, prepared.held_out.geometry.angles)
     assert (geometry.axis_col, geometry.pixel_pitch) == (prepared.geometry.axis_col, prepared.geometry.pixel_pitch)
     same = with_held_out(prepared.projections.data, prepared.geometry, None)
     assert same[1] is prepared.geometry and same[2] == []

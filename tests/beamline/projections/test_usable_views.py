@@ -51,7 +51,7 @@ def test_what_is_left_out_and_what_weighs_half_is_told_in_a_line(tmp_path: Path)
 def test_a_selection_and_the_views_held_out_are_of_the_good_views(tmp_path: Path) -> None:
     found, _ = prepare(scan(tmp_path), replace(SELECTION, views="fixed:8"))
     assert found.held_out is not None
-    used = np.round(np.degrees(np.concatenate((found.geometry.angles, found.held_out[1].angles))) / 6).astype(int)
+    used = np.round(np.degrees(np.concatenate((found.geometry.angles, found.held_out.geometry.angles))) / 6).astype(int)
     assert not set(used + FIRST) & set(ALARMS)
     everything, _ = prepare(tmp_path / "scan.h5", SELECTION)
     kept = hold_out(everything, 4, advice="")

@@ -28,7 +28,7 @@ from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.frame import Frame, FrameKind
 from recon.assess.metrics import psnr
 from recon.base.method import Progress, Reconstruction
-from recon.prep.correct import Projections
+from recon.prep.projections import Projections
 from recon.splatting.stream import StreamingFit
 from tests.beamline.reconstruct.growing_scan import (
     BRIEF,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamline.storage.flag_legend import TODAY, FrameFlags
-from beamline.storage.frame_table import FrameTable
+from beamline.storage.frame_table import FrameTable, kinds_of
 from drivers.base.frame import FrameKind
 
 N = 12
@@ -96,3 +96,9 @@ def test_a_view_that_was_taken_again_has_the_number_of_the_first() -> None:
     assert (table.numbers_taken(), table.numbers_taken(3)) == ({0, 1}, {0})
     frame = table.frame(3, np.zeros((2, 2), np.uint16))
     assert (frame.kind, frame.index, frame.replaces, frame.aside) == (FrameKind.PROJECTION, 3, 1, 0.0)
+
+
+def test_image_keys_that_nobody_defined_are_invalid_frames() -> None:
+    """A wide view has the key of a projection, in a file: -2 says nothing."""
+    kinds = kinds_of(np.array([0, 1, 2, 3, -1, -2, 4, 255], np.int16))
+    assert kinds.tolist() == [0, 1, 2, 3, -1, 3, 3, 3] and kinds.dtype == np.int32

@@ -17,7 +17,8 @@ from recon.base.kernel import Truncation
 from recon.base.method import DataUse, Reconstruction
 from recon.base.view_data import Views
 from recon.base.volume import Grid
-from recon.prep.correct import References, correct
+from recon.prep.correct import correct
+from recon.prep.references import References
 from recon.reconstruction import reconstruct
 from recon.splatting import optimise as fit
 from recon.splatting.gaussians import Gaussians

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from recon.prep.align import AxisError, AxisEstimate, axis_from_pair, find_axis
 from recon.prep.axis_wedge import axis_from_sinogram
-from recon.prep.correct import References, correct
+from recon.prep.correct import correct
+from recon.prep.references import References
 
 COLS = 128
 HALF_TURN = np.arange(180) * np.pi / 180

@@ -13,17 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.prep.correct import (
-    CorrectionSettings,
-    Plan,
-    Projections,
-    References,
-    apply,
-    correct,
-    merge_and_empty,
-    survey,
-)
-from recon.prep.references import air_columns, dead_pixels, edge_profiles
+from recon.prep.correct import Plan, apply, correct
+from recon.prep.counts_plan import CorrectionSettings, survey
+from recon.prep.projections import Projections, merge_and_empty
+from recon.prep.references import References, air_columns, dead_pixels, edge_profiles
 
 PLAIN = CorrectionSettings(hot_threshold=np.inf, zinger_threshold=np.inf, air="none")
 

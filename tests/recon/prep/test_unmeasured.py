@@ -7,7 +7,9 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from recon.base.arrays import Mask
-from recon.prep.correct import CorrectionSettings, Plan, References, apply, survey
+from recon.prep.correct import Plan, apply
+from recon.prep.counts_plan import CorrectionSettings, survey
+from recon.prep.references import References
 from recon.prep.unmeasured import foreign_rows, runs_of, unmeasured, with_borders_filled, with_rim
 
 SHAPE, VIEWS = (20, 64), 32

@@ -94,7 +94,7 @@ class Hardening:
         if curve is not None:
             curve.linearise(views.projections.data, views.projections.weights)
             if views.held_out is not None:
-                curve.linearise(views.held_out[0])
+                curve.linearise(views.held_out.data)
         return StepDone(sentence, {"hardening": sentence})
 
 

@@ -254,7 +254,7 @@ def without_learnt_gains(views: PreparedProjections, progress: Progress) -> Step
     for view in views.projections.data:
         view -= learnt.pixels
     if views.held_out is not None:
-        views.held_out[0][...] -= learnt.pixels
+        views.held_out.data[...] -= learnt.pixels
     sentence = (
         f"Gains learnt with the volume: {float(learnt.pixels.std()):.4f} of line integral (standard deviation) taken "
         f"off; {judged}. None within {NEAR_AXIS:g} columns of the axis: there a gain looks like a body on the axis."

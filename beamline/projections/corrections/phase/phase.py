@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from beamline.storage.readers.base import ScanSource
     from recon.base.geometry import Geometry
     from recon.features.phase import Paganin
-    from recon.prep.correct import Projections
+    from recon.prep.projections import Projections
 
 _AUTO = "auto"
 _NO_FILTER = "No filter predicts views held out (of 16 or more) better; give --phase paganin:RATIO for delta/beta."

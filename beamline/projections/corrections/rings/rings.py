@@ -54,5 +54,5 @@ class Rings:
             return StepDone(sentence, {"rings": self.way, **({"rings_seen": sentence} if sentence else {})})
         stripes, sentence = remove_rings_in_place(data, angles, self.way, axis_col)
         if views.held_out is not None:
-            views.held_out[0][...] -= stripes
+            views.held_out.data[...] -= stripes
         return StepDone(sentence, {"rings": self.way, **({"rings_removed": sentence} if sentence else {})})

@@ -52,11 +52,11 @@ def test_rays_that_were_not_measured_do_not_count(data: TrialData, method: str) 
     measured[:, :5] = False
     figures = []
     for filled in (0.0, 3.0):
-        used, (held, unseen) = data.prepared.projections.data.copy(), data.prepared.held_out
+        used, unseen = data.prepared.projections.data.copy(), data.prepared.held_out
         used[:, :, :5] = filled
         views = replace(data.prepared.projections, data=used)
-        held = np.where(measured, held, np.float32(filled))
-        given = replace(data.prepared, projections=views, held_out=(held, unseen), measured=measured)
+        held = replace(unseen, data=np.where(measured, unseen.data, np.float32(filled)))
+        given = replace(data.prepared, projections=views, held_out=held, measured=measured)
         trial = MethodTrial("method", method, data.geometry.n_views)
         found = run(trial, replace(data, prepared=given))
         figures.append([*found.metrics.values(), *found.squared_residuals])
@@ -71,7 +71,7 @@ def test_the_figures_are_those_of_an_fbp_of_the_same_views(data: TrialData) -> N
     assert data.truth is not None and data.prepared.held_out is not None
     assert found.metrics["psnr"] == pytest.approx(psnr(data.truth, expected))
     volume = Volume(expected, Grid.matching(data.geometry))
-    unseen, geometry = data.prepared.held_out
+    unseen, geometry = data.prepared.held_out.data, data.prepared.held_out.geometry
     resolution = ViewResolution.of(geometry, volume.grid)
     seen = at_voxel_resolution(np.ascontiguousarray(unseen.swapaxes(1, 2)), resolution).swapaxes(1, 2)
     left = np.linalg.norm(project(volume, geometry) - seen) / np.linalg.norm(unseen)
@@ -85,8 +85,8 @@ def test_a_fit_does_not_learn_from_the_views_that_judge_it(data: TrialData) -> N
     """Spoiling them changes its residual and nothing else."""
     trial = MethodTrial("method", "r2", 27, settings={"steps": 100, "gaussians": 150})
     assert data.prepared.held_out is not None
-    unseen, geometry = data.prepared.held_out
-    spoilt = replace(data, prepared=replace(data.prepared, held_out=(2 * unseen, geometry)))
+    unseen = data.prepared.held_out
+    spoilt = replace(data, prepared=replace(data.prepared, held_out=replace(unseen, data=2 * unseen.data)))
     kept, other = (run(trial, d).metrics for d in (data, spoilt))
     assert kept["psnr"] == other["psnr"] and kept["residual_held_out"] < other["residual_held_out"]
 

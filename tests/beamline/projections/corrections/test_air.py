@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 import recon
 from beamline.projections.corrections.air import without_background
 from recon.base.geometry import Geometry
+from recon.base.view_data import Views
 from simulators.frame.shot import Detector
 from simulators.samples.bodies.phantom import Phantom
 from simulators.samples.bodies.solids import Cylinder, Ellipsoid
@@ -103,7 +104,7 @@ def test_views_held_out_lose_their_background_by_their_own_air() -> None:
     drift = np.linspace(0, -0.02, 60, dtype=np.float32)[:, None, None]
     views, used, unseen = clean + BENT + drift, np.arange(0, 60, 2), np.arange(1, 60, 10)
     others = views[unseen].copy()
-    without_background(views[used].copy(), GEOMETRY.select(used), "auto", (others, GEOMETRY.select(unseen)))
+    without_background(views[used].copy(), GEOMETRY.select(used), "auto", Views(others, GEOMETRY.select(unseen)))
     assert np.sqrt(np.mean((others - clean[unseen]) ** 2)) < 0.003
 
 

@@ -27,7 +27,7 @@ from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions, open_scan
 from recon.base.geometry import Geometry
-from recon.prep.correct import Projections
+from recon.prep.projections import Projections
 from recon.prep.resample import Distortion
 from recon.voxels.direct import Fbp
 from tests.beamline.scans import TwoCylinders, write_exchange

@@ -176,7 +176,7 @@ def test_a_part_of_the_scan_keeps_its_rays(tmp_path: Path, selected: dict[str, o
     assert np.abs(left).max() < 0.02 and np.sqrt(np.mean(left**2)) < 0.002
     assert found.geometry.n_views == (N // 2 if "views" in selected else N)
     if found.held_out is not None:
-        data, views = found.held_out
+        data, views = found.held_out.data, found.held_out.geometry
         np.testing.assert_allclose(data, ellipsoid_shadow(views, AXES, CENTRE), atol=0.012)
 
 
@@ -185,10 +185,10 @@ def test_rays_outside_the_slices_weigh_nothing_also_of_views_held_out(tmp_path: 
     path = scan(tmp_path, posed(), AXES * (1, 1, 20))
     found = prepared(path, every(tmp_path), rows=(8, 16), views="every:2")
     assert found.held_out is not None
-    n, others = found.geometry.n_views, found.held_out[1].n_views
+    n, others = found.geometry.n_views, found.held_out.geometry.n_views
     weights, grid = found.ray_weights(others), Grid.matching(found.geometry)
     assert weights is not None and weights.shape[0] == n + others and 0 < weights.mean() < 1
-    np.testing.assert_array_equal(weights[n:] > 0, seen_rays(found.held_out[1], grid))
+    np.testing.assert_array_equal(weights[n:] > 0, seen_rays(found.held_out.geometry, grid))
     assert not weights[n:].all()
 
 
@@ -207,7 +207,7 @@ def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp
     with pytest.raises(DataError, match=r"of 20 of.*frame 5, at 31.5 degrees.*--views"):
         prepared(path, table(tmp_path, head, *(column[::2] for column in columns)))
     found = prepared(path, table(tmp_path, head, *(column[:30] for column in columns)), views="first:20")
-    assert found.geometry.n_views == 20 and found.held_out is not None and found.held_out[1].n_views <= 10
+    assert found.geometry.n_views == 20 and found.held_out is not None and found.held_out.geometry.n_views <= 10
 
 
 @pytest.mark.parametrize(

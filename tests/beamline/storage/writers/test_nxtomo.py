@@ -169,15 +169,16 @@ def test_an_empty_scan_is_still_a_file(tmp_path: Path, clock: SteppedClock) -> N
         assert source.pixel_size_mm is None
 
 
-@pytest.mark.parametrize("kind", [FrameKind.PROJECTION, FrameKind.FLAT, FrameKind.DARK, FrameKind.ALIGNMENT])
+@pytest.mark.parametrize("kind", [kind for kind in FrameKind if kind is not FrameKind.INVALID])
 def test_a_frame_that_was_taken_again_is_not_taken_for_damaged(
     write: Write, frames: list[Frame], kind: FrameKind
 ) -> None:
     """As flats and views on the way back are after a time without beam."""
     first = replace(frames[-1], index=14, kind=kind)
     path = write([*frames, first, replace(first, index=15, replaces=14)])
+    logged = max(kind, FrameKind.ALIGNMENT)  # a wide view is one by its translation, which this file lacks
     with open_scan(path) as source:
-        assert not source.table.altered.any() and source.table.kinds[14:].tolist() == [FrameKind.INVALID, kind]
+        assert not source.table.altered.any() and source.table.kinds[14:].tolist() == [FrameKind.INVALID, logged]
 
 
 def test_an_alignment_frame_is_no_view_to_those_who_do_not_know_it(write: Write, frames: list[Frame]) -> None:

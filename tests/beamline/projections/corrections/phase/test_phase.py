@@ -19,7 +19,7 @@ from beamline.projections.selection import Selection
 from beamline.projections.step import NamedStep
 from beamline.projections.views import evidence_of
 from recon.features.phase import FilterLength
-from recon.prep.correct import Projections, merge_and_empty
+from recon.prep.projections import Projections, merge_and_empty
 from tests.beamline.array_source import ArraySource, counted
 from tests.beamline.projections.corrections.test_memory import peak
 from tests.beamline.scans import BEAM, DARK

@@ -1,0 +1,299 @@
+"""CorrectionPlan: what makes line integrals of the counts of one scan, by its darks and flats; `survey` makes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F32, F64, I64, Mask
+from recon.base.choices import SPOT_ERRORS
+from recon.base.declared_types import check_settings
+from recon.base.masks import Fill, Image, areas, fill, plan_fill
+from recon.prep.counts import Photons, of_view
+from recon.prep.dynamic_flats import DynamicFlats
+from recon.prep.projections import Projections
+from recon.prep.references import (
+    References,
+    air_columns,
+    air_light,
+    check,
+    dead_pixels,
+    edge_depth,
+    edge_profiles,
+    flat_at,
+)
+from recon.prep.spots import SpotFilter, Transmission
+from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
+
+
+class UnlitViewsError(ValueError):
+    """The air columns of some views are dark."""
+
+
+@dataclass(frozen=True)
+class CorrectionSettings:
+    """Settings of the correction from counts to line integrals.
+
+    Attributes:
+        floor: lowest transmission; below it, also for zero and negative values, the line integral is -log(floor).
+        hot_threshold: robust standard deviations by which a pixel's dark, or its response to the beam, must differ from
+            its neighbours to be masked; inf masks none.
+        zinger_threshold: standard deviations by which a spot is brighter than what is around it, and than the
+            neighbouring views, see `recon.prep.spots.spots`; inf fills none.
+        air: columns (left, right) that see no sample in any view, or "auto" to find them, or "none". Each view is
+        divided by their level, or by the line through the levels of both sides.
+        sample_from: line integral at the edges from which "auto" takes them for sample, see `references.edge_depth`.
+    """
+
+    floor: float = 1e-4
+    hot_threshold: float = 10.0
+    zinger_threshold: float = SPOT_ERRORS
+    air: Literal["none", "auto"] | tuple[int, int] = "auto"
+    sample_from: float = np.inf
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+        if not 0 < self.floor < 1:
+            raise ValueError(f"floor is a transmission between 0 and 1, got {self.floor}")
+        if not (self.hot_threshold > 0 and self.zinger_threshold > 0):
+            raise ValueError(
+                f"thresholds must be positive (inf turns one off), got hot {self.hot_threshold}, "
+                f"zinger {self.zinger_threshold}"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectionPlan:
+    """What makes line integrals of the counts of one scan; `survey` makes it, and `apply` follows it.
+
+    Views come in the order they were taken, in batches of any size. A view depends on the references, on the air
+    columns found in all views surveyed so far, and on its two neighbours. So the newest view waits for the next one.
+    With the same references and air columns the line integrals are the same to the bit for any split into batches.
+
+    Attributes:
+        settings: of the correction.
+        dark: float32 [row, col].
+        flats: (position, float32 [row, col]) of each group of flats, in order, without its dark; 1 in masked pixels.
+        part_starts, dynamic: as of `References`.
+        masked: bool [row, col], pixels that are filled in every view.
+        hidden: bool [row, col], `masks.areas` of them.
+        filling: in which order they are filled, see `masks.plan_fill`.
+        photons: the line integrals and weights carry the likelihood of the counts, see `counts.line_integrals`; None:
+            the line integrals are logarithms.
+        foreign: bool [row], rows in which what is dark is not the sample, see `unmeasured`; None: none.
+        light: float64 [frame of the scan], by how much that of a view grows; None: all views are alike.
+        spots: the filter of spots after the views so far.
+        profiles: `edge_profiles` of the views so far, by batch, with their numbers int64 [view].
+    """
+
+    settings: CorrectionSettings
+    dark: Image
+    flats: tuple[tuple[float, Image], ...]
+    part_starts: tuple[int, ...]
+    dynamic: DynamicFlats | None
+    masked: Mask
+    hidden: Mask
+    filling: Fill
+    spots: SpotFilter
+    photons: Photons | None = None
+    foreign: Mask | None = None
+    light: F64 | None = None
+    profiles: tuple[tuple[F32, I64], ...] = ()
+
+    @cached_property
+    def air_columns(self) -> tuple[int, int]:
+        """(left, right) columns of air from the views surveyed so far; (0, 0) if there are none."""
+        air = self.settings.air
+        if air != "auto":
+            return (0, 0) if air == "none" else air
+        if not self.profiles:
+            return 0, 0
+        profiles, ids = (np.concatenate(each) for each in zip(*self.profiles, strict=True))
+        columns = air_columns(profiles, self.dark.shape[1])
+        if not any(columns) or not np.isfinite(self.settings.sample_from):
+            return columns
+        depth = edge_depth(profiles, ids, [position for position, _ in self.flats], columns)
+        return (0, 0) if depth > self.settings.sample_from else columns
+
+    def transmission(
+        self,
+        counts: NDArray[np.generic],
+        positions: NDArray[np.float64],
+        view_ids: NDArray[np.int64],
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Transmission:
+        """(counts - dark) / (flat - dark) with bad pixels filled from their neighbours.
+
+        Args:
+            counts: [view, row, col], any real type, in the order of acquisition.
+            positions: [view], number of the frame in the scan, as in the flats' positions.
+            view_ids: int64 [view].
+            progress: how many views are done, after each.
+
+        Raises:
+            ValueError: for shapes that do not fit, positions or more than half of a view not finite.
+        """
+        _check_views(counts, positions, self.dark.shape)
+        if view_ids.shape != counts.shape[:1]:
+            raise ValueError(f"view_ids must have shape {counts.shape[:1]}, got {view_ids.shape}")
+        data, repaired = np.empty(counts.shape, np.float32), np.zeros(len(counts), np.int64)
+        beam, runs = None if self.photons is None else np.empty(counts.shape, np.float32), [NO_RUNS]
+        for v, view in enumerate(data):
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                np.subtract(counts[v], self.dark, out=view, casting="unsafe")
+                flat = self._flat_of(view, float(positions[v]))
+                view /= flat
+            if beam is not None and self.photons is not None:
+                np.divide(flat, np.float32(self.photons.gain), out=beam[v])
+                fill(beam[v], self.filling)
+            bad = ~np.isfinite(view) & ~self.masked
+            repaired[v] = bad.sum()
+            if repaired[v] > view.size / 2:
+                raise ValueError(
+                    f"view {view_ids[v]}: {repaired[v]} of {view.size} pixels are not finite; leave this view out"
+                )
+            if (unseen := unmeasured(counts[v], view, self.hidden, self.foreign)) is not None:
+                runs.append(runs_of(unseen, int(view_ids[v])))
+                repaired[v] -= np.count_nonzero(bad & unseen)
+                bad |= unseen
+            fill(view, plan_fill(bad | self.masked) if repaired[v] or unseen is not None else self.filling)
+            progress(v + 1)
+        if self.light is not None:
+            light = self.light[view_ids].astype(np.float32)[:, None, None]
+            np.multiply(data, light, out=data)
+            if beam is not None:
+                np.divide(beam, light, out=beam)
+        return Transmission(data, view_ids, repaired, np.ones(len(data), np.float32), beam, np.concatenate(runs))
+
+    def _flat_of(self, view: Image, position: float) -> Image:
+        """Net flat of a view [row, col] without its dark; 1 in masked pixels."""
+        between = flat_at(position, self.flats, self.part_starts)
+        if self.dynamic is None:
+            return between
+        live = ~self.masked
+        level = between[live].mean() / self.dynamic.mean[live].mean()
+        return np.where(self.masked, np.float32(1), level * self.dynamic.flat_of(view / level, self.settings.floor))
+
+    def surveyed(self, views: Transmission) -> CorrectionPlan:
+        """The plan by which these views, too, were used in the search for air columns; of all views, it has theirs."""
+        if self.settings.air != "auto":
+            return self
+        return replace(self, profiles=(*self.profiles, (edge_profiles(views.data), views.view_ids)))
+
+    def line_integrals(
+        self,
+        views: Transmission | None,
+        last: bool = True,
+        progress: Callable[[int], None] = lambda done: None,
+        order: NDArray[np.intp] | None = None,
+    ) -> tuple[Projections, CorrectionPlan]:
+        """Line integrals of these views and of the waiting one, and the plan of the views that follow.
+
+        Args:
+            views: the next ones, whose memory the result takes over; None: the scan has ended with the waiting view.
+            last: no view comes after these; else the newest view waits.
+            progress: how many views are free of spots, after each; the logarithm that follows takes little time.
+            order: of their neighbours, see `SpotFilter.feed`.
+
+        Raises:
+            UnlitViewsError: the air columns of some views are dark; it has their numbers.
+        """
+        settings, columns, floored = self.settings, self.air_columns, 0
+        views, spots = self.spots.feed(views and self._levelled(views), last, progress, order)
+        for v, view in enumerate(views.data):
+            if views.beam is not None:
+                self._likelihood(view, views.beam[v])
+                continue
+            low = view < settings.floor
+            floored += int((low & ~self.masked).sum())
+            view[low] = settings.floor
+            np.negative(np.log(view, out=view), out=view)
+        live = max(int((~self.masked).sum()) * len(views.data), 1)
+        replaced = int(views.repaired.sum()) / live
+        return Projections(
+            views.data, views.view_ids, floored / live, views.air, self.masked, columns, replaced, views.beam,
+            views.unmeasured, spots.left,
+        ), replace(self, spots=spots)  # fmt: skip
+
+    def _levelled(self, views: Transmission) -> Transmission:
+        """The views divided by their air, in place."""
+        light, columns = air_light(views.data, *self.air_columns), self.air_columns
+        unlit = views.view_ids[~(light.min(axis=1) > self.settings.floor)]
+        if unlit.size:
+            raise UnlitViewsError(
+                f"no beam in {unlit.size} of {len(light)} views ({unlit[:8].tolist()} ...): the air columns, "
+                f"{columns[0]} left and {columns[1]} right, are dark; leave these views out"
+            )
+        views.data[...] /= light[:, None]
+        beam = None if views.beam is None else views.beam * light[:, None]
+        return replace(views, air=light.mean(axis=1), beam=beam)
+
+    def _likelihood(self, view: Image, beam: Image) -> None:
+        """Replace a view's transmission by line integrals, and the photons of its beam by their weights."""
+        assert self.photons is not None
+        light = beam.astype(np.float64)
+        extra = np.full(view.shape, self.photons.variance / self.photons.gain**2)
+        p, w = of_view(np.maximum(view * light, -extra), light, extra)
+        view[...] = np.where(w > 0, p, 0)
+        beam[...] = np.where(self.masked, 0, w)
+
+
+def survey(
+    references: References,
+    settings: CorrectionSettings | None = None,
+    masked: Mask | None = None,
+    standing: Mask | None = None,
+    **known: Any,
+) -> CorrectionPlan:
+    """The plan of views with these references.
+
+    Args:
+        references: darks and flats of the detector area of the views.
+        masked: bool [row, col], pixels to fill; None: `dead_pixels` of the references.
+        standing: bool [row, col], pixels to fill besides, in the shadow of an object; None: none.
+        known: `photons`, `foreign` and `light` of the plan.
+
+    Raises:
+        ValueError: for shapes that do not fit, no flats, or no beam in the flats.
+    """
+    settings = CorrectionSettings() if settings is None else settings
+    check(references)
+    dark = np.asarray(references.dark, np.float32)
+    air, cols = settings.air, dark.shape[1]
+    if isinstance(air, tuple) and not (min(air) >= 0 and 0 < sum(air) <= cols):
+        raise ValueError(f"air columns (left, right) {air} do not fit {cols} columns")
+    if masked is not None and np.shape(masked) != dark.shape:
+        raise ValueError(f"masked must have shape {dark.shape}, got {np.shape(masked)}")
+    if masked is None:
+        masked = dead_pixels(dark, [flat for _, flat in references.flats], settings.hot_threshold)
+    masked = masked if standing is None else masked | standing
+    with np.errstate(invalid="ignore", over="ignore"):
+        flats = tuple(
+            (position, np.where(masked, np.float32(1), np.asarray(flat, np.float32) - dark))
+            for position, flat in sorted(references.flats, key=lambda group: group[0])
+        )
+    spots = SpotFilter(settings.zinger_threshold, lambda light: np.sqrt(np.maximum(light, 0)))
+    starts, hidden, filling = references.part_starts, areas(masked), plan_fill(masked)
+    return CorrectionPlan(
+        settings, dark, flats, starts, references.dynamic, masked, hidden, filling, spots, **known
+    )  # fmt: skip
+
+
+def _check_views(counts: NDArray[np.generic], positions: NDArray[np.float64], shape: tuple[int, ...]) -> None:
+    if counts.ndim != 3 or counts.size == 0:
+        raise ValueError(f"counts must be [view, row, col] with at least one view, got shape {counts.shape}")
+    if counts.shape[1:] != shape:
+        raise ValueError(f"the dark has shape {shape}, the views {counts.shape[1:]}")
+    if np.shape(positions) != counts.shape[:1]:
+        raise ValueError(
+            f"positions must hold one number for each of {len(counts)} views, got shape {np.shape(positions)}"
+        )
+    if not np.isfinite(positions).all():
+        raise ValueError(
+            f"the positions of views {np.flatnonzero(~np.isfinite(positions))[:8].tolist()} are not finite"
+        )

@@ -1,0 +1,82 @@
+"""Projections: line integrals, and what a correction changed in them; batches of them joined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import I64, Mask
+from recon.base.masks import areas
+from recon.prep.unmeasured import NO_RUNS
+
+
+@dataclass(frozen=True, eq=False)
+class Projections:
+    """Line integrals, and what the correction changed.
+
+    Attributes:
+        data: float32 [view, row, col], dimensionless, finite.
+        view_ids: int64 [view].
+        floored: fraction of the live pixels that were set to -log(floor).
+        air: float32 [view], transmission of the air, by which each view was divided, on average; 1 without air columns.
+        masked: bool [row, col], dead and hot pixels, filled from their neighbours in every view.
+        air_columns: (left, right) number of columns in which `air` was measured; (0, 0): none.
+        replaced: fraction of the live pixels that were spots or not finite in one view; filled from their neighbours.
+        weights: float32 [view, row, col], inverse variances of the line integrals by the photons expected, 0 for masked
+            pixels; None: photons were not counted.
+        unmeasured: int64 [run, 4], pixels that measured nothing in a view, filled from their neighbours: the view's
+            number, row, first column, column after the last.
+        spots_left: pixels of bright spots that were too large to be filled, in these views and those before.
+    """
+
+    data: NDArray[np.float32]
+    view_ids: NDArray[np.int64]
+    floored: float
+    air: NDArray[np.float32]
+    masked: Mask
+    air_columns: tuple[int, int] = (0, 0)
+    replaced: float = 0.0
+    weights: NDArray[np.float32] | None = None
+    unmeasured: I64 = field(default_factory=NO_RUNS.copy)
+    spots_left: int = 0
+
+    @property
+    def lit(self) -> Mask | None:
+        """bool [view, row, col], pixels that measured something; None: all, but for lines, which are interpolated."""
+        lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
+        at = {int(view): number for number, view in enumerate(self.view_ids)}
+        for view, row, first, end in self.unmeasured[np.isin(self.unmeasured[:, 0], self.view_ids)].tolist():
+            lit[at[view], row, first:end] = False
+        return None if lit.all() else lit
+
+    @property
+    def measured(self) -> NDArray[np.float32]:
+        """The line integrals, NaN where a pixel measured nothing."""
+        return self.data if (lit := self.lit) is None else np.where(lit, self.data, np.float32(np.nan))
+
+
+def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None = None) -> Projections:
+    """Join batches of a scan's views. The list is emptied meanwhile, so that only few views are in memory twice.
+
+    The air columns, the mask and the spots left are those of the last batch.
+
+    Args:
+        data: the line integrals of all, if they are together already; those of the batches do not count then.
+    """
+    n = np.array([part.view_ids.size for part in parts], np.float64)
+    weights, last = n / max(n.sum(), 1), parts[-1]
+    ids, air, runs = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("view_ids", "air", "unmeasured")
+    )
+    floored, replaced = (float(weights @ [getattr(part, name) for part in parts]) for name in ("floored", "replaced"))
+    each = [part.weights for part in parts if part.weights is not None]
+    counted = np.concatenate(each) if each else None
+    if data is None:
+        data, at = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
+        while parts:
+            part = parts.pop(0).data
+            data[at : at + len(part)] = part
+            at += len(part)
+    return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs, last.spots_left)
