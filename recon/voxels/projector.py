@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -152,7 +153,7 @@ class Projector:
         """A x: volume [y, x, z] to projections [view, col, row]."""
         views, rows, cols = self.projection_shape
         result = np.empty((views, cols, rows), np.float32)
-        if self._to_rows():
+        if self._to_rows:
             self._mean("forward", volume, result)
         else:
             slices = np.empty((views, cols, self.grid.shape[0]), np.float32)
@@ -165,7 +166,7 @@ class Projector:
         nz, ny, nx = self.grid.shape
         result = np.empty((ny, nx, nz), np.float32) if out is None else out
         projections = self._spread(projections)
-        if not self._to_rows():
+        if not self._to_rows:
             slices = np.empty((*projections.shape[:2], nz), np.float32)
             slices_from_rows(projections, *levels(self.geometry, self.grid), slices)
             projections = slices
@@ -216,10 +217,9 @@ class Projector:
         """All rays of straight views run in the plane of the only slice: a parallel beam, or a fan."""
         if self.grid.shape[0] > 1 or not self.geometry.is_cone:
             return self.grid.shape[0] == 1
-        middle = (self.grid.shape[0] - 1) / 2 - self.grid.centre[0] / self.grid.spacing[0]
-        rows = self.geometry.axis_row + self.geometry.shifts[:, 1]
-        return self.geometry.detector_shape[0] == 1 and middle == 0 and not rows.any()
+        return self.geometry.is_fan and self.grid.centre[0] == 0
 
+    @cached_property
     def _to_rows(self) -> bool:
         """The kernels give rows of the detector, not lines of slices: each ray has a height of its own, or slice k lies
         on row k of every view."""
