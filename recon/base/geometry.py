@@ -28,6 +28,7 @@ import math
 import operator
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, Unpack
 
 import numpy as np
@@ -176,7 +177,13 @@ class Geometry:
     def is_cone(self) -> bool:
         return math.isfinite(self.sod)
 
-    @property
+    @cached_property
+    def is_fan(self) -> bool:
+        """All rays of the cone run in the plane of its source across the rotation axis: one straight row."""
+        level = self.detector_shape[0] == 1 and not (self.axis_row + self.shifts[:, 1]).any()
+        return self.is_cone and self.is_straight and level
+
+    @cached_property
     def is_straight(self) -> bool:
         """Rows run along u and columns along the rotation axis: no roll, tilt or centres (views may be shifted)."""
         return not (self.roll.any() or self.tilt.any() or self.centres.any())

@@ -57,6 +57,13 @@ def _along_columns(
                 share = _f((sod / depth) ** 2)
                 climb = step * magnify
                 base = z[0] * magnify + row0[v] + 1.0
+                if nz == 1:
+                    if base >= 0.5 and base <= rows + 0.5:
+                        row = math.floor(base)
+                        a, b = filtered[v, low], filtered[v, low + 1]
+                        one, other = a[row] + part * (b[row] - a[row]), a[row + 1] + part * (b[row + 1] - a[row + 1])
+                        out[j, i, 0] += share * (one + _f(base - row) * (other - one))
+                    continue
                 first = math.ceil(max((0.5 - base) / climb, 0.0))
                 end = math.floor(min((rows + 0.5 - base) / climb, nz - 1.0)) + 1
                 if end <= first:

@@ -155,7 +155,7 @@ def taller_than_field(projections: F32, geometry: Geometry) -> bool:
     Args:
         projections: line integrals [view, row, col]; values that are not finite do not count.
     """
-    if not geometry.is_cone or not len(projections):
+    if not geometry.is_cone or not len(projections) or geometry.is_fan:
         return False
     if geometry.climbs:  # a sample that ends within the heights of a helix fills the rows of most views
         at = geometry.offsets[:, 1]

@@ -203,8 +203,13 @@ class PnpDct(VoxelMethod):
         return {}
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
-        """The prediction with the best threshold; with one of its own that of the method's volume."""
-        if self.patch_threshold is not None or trial.prior is None:
+        """The prediction with the best threshold; with one of its own that of the method's volume.
+
+        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.prior`.
+        """
+        if self.patch_threshold is None and trial.settings.wide and so_far.tried:
+            return Prediction(self.name, remark=f"{self.name} not tried of a sample wider than the field")
+        if self.patch_threshold is not None or trial.prior is None or not trial.prior.strength:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)
 

@@ -94,7 +94,7 @@ def choose_patches(
     """
 
     def chosen() -> list[float]:
-        if problem.prior is not None and problem.prior.strength:
+        if problem.prior is not None:
             return [problem.prior.strength, problem.prior.patches]
         judge = None if isinstance(weight, NoiseBalance) else trial()
         first = FIRST_THRESHOLD * noise_of_volume(problem if judge is None else judge.problem)
@@ -278,9 +278,15 @@ class Trial:
 
     @cached_property
     def prior(self) -> Prior | None:
-        """The weight of all views, and patches after it; None: as of `weight`."""
+        """The weight of all views, and patches after it; None: as of `weight`.
+
+        Of a sample wider than the field without patches: what lies beside it is in all views, and they leave less of
+        those held out where total variation is closer to the truth by 0.4 and 0.6 dB, in twice the time.
+        """
         if self.weight is None:
             return None
+        if self.settings.wide:
+            return Prior(self.weight)
         return Prior(self.weight, *choose_patches(self.scan, self.weight, lambda: self, PATCH_STEPS))
 
     def compare(self, candidates: Sequence[Method], least_gain: float = LEAST_GAIN) -> TrialChoice:

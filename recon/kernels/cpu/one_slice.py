@@ -152,12 +152,42 @@ def _adjoint(
                 first, last = _group(rays, steep, v, axis, last)
 
 
+@njit(**OPTIONS)
+def _pad(image: F32, ys: F32, xs: F32) -> None:
+    """An image [y, x] as padded lines along x [y, x] and along y [x, y]."""
+    ny, nx = image.shape
+    for y in prange(len(ys)):
+        ys[y] = _f(0)
+        if y < ny:
+            ys[y, _BEFORE : _BEFORE + nx] = image[y]
+    for band in prange(len(xs) // _BAND):
+        x, straight = band * _BAND, np.zeros(_BAND, np.intp)
+        tile = np.empty((_BAND, _BAND), np.float32)
+        xs[x : x + _BAND] = _f(0)
+        for y in range(0, len(ys), _BAND):
+            lanes.load_turned(ys, y, _BEFORE + x, straight, tile, 0)
+            for k in range(_BAND):
+                lanes.store(xs, x + k, _BEFORE + y, lanes.load(tile, k, 0))
+
+
+@njit(**OPTIONS)
+def _join(ys: F32, xs: F32, out: F32) -> None:
+    """out [y, x]: the sum of padded lines along x and along y."""
+    ny, nx = out.shape
+    for band in prange(len(ys) // _BAND):
+        y, straight = band * _BAND, np.zeros(_BAND, np.intp)
+        tile = np.empty((_BAND, _BAND), np.float32)
+        for x in range(0, nx, _BAND):
+            lanes.load_turned(xs, x, _BEFORE + y, straight, tile, 0)
+            for k in range(min(_BAND, ny - y)):
+                both = lanes.load(ys, y + k, _BEFORE + x) + lanes.load(tile, k, 0)
+                lanes.store_first(out, y + k, x, both, min(_BAND, nx - x))
+
+
 def forward(image: F32, rays: F64, steep: Flags, out: F32) -> None:
     """Line integrals of image [y, x] into out [view, col], in mm times the unit of the image."""
     ys, xs = (_lines(lines.shape) for lines in (image, image.T))
-    for padded, lines in ((ys, image), (xs, image.T)):
-        padded[...] = 0
-        _inner(padded, lines.shape)[...] = lines
+    _pad(image, ys, xs)
     for part in calls(len(out), image.size):
         _forward(ys, xs, image.shape, rays, steep, part.start, part.stop, out)
 
@@ -168,14 +198,9 @@ def adjoint(projections: F32, rays: F64, steep: Flags, out: F32) -> None:
     for axis, lines in enumerate((ys, xs)):
         for part in calls(len(lines) // _BAND, _BAND * projections.size):
             _adjoint(projections, out.shape[1 - axis], rays, steep, axis, part.start, part.stop, lines)
-    np.add(_inner(ys, out.shape), _inner(xs, out.T.shape).T, out=out)
+    _join(ys, xs, out)
 
 
 def _lines(shape: tuple[int, ...]) -> F32:
     """Room for lines [line, voxel] in whole bands, between zeros."""
     return np.empty((-(-shape[0] // _BAND) * _BAND, _BEFORE + shape[1] + _BEHIND), np.float32)
-
-
-def _inner(padded: F32, shape: tuple[int, ...]) -> F32:
-    """The lines without what is around them."""
-    return padded[: shape[0], _BEFORE : _BEFORE + shape[1]]

@@ -102,6 +102,17 @@ def test_a_far_source_is_fbp() -> None:
     np.testing.assert_allclose(fdk(views, far, grid), fbp(views, near, grid), atol=2e-3)
 
 
+@pytest.mark.parametrize("rows", [1, 6])
+def test_a_slice_alone_is_that_of_a_stack(rows: int, rng: np.random.Generator) -> None:
+    views = Geometry.cone(circle(20), (rows, 20), 1.0, 60.0, 90.0)
+    data = rng.random((20, rows, 20), dtype=np.float32)
+    stack = fdk(data, views, Grid((9, 20, 20), 0.7))
+    for z in range(9):
+        alone = fdk(data, views, Grid((1, 20, 20), 0.7, ((z - 4) * 0.7, 0.0, 0.0)))
+        np.testing.assert_allclose(alone[0], stack[z], rtol=1e-5, atol=2e-5 * stack.max())
+    assert stack[4].any() and not stack[[0, 8]].all()
+
+
 def test_a_voxel_off_the_detector_gets_nothing() -> None:
     geometry = Geometry.cone(circle(30), (4, 40), 0.1, 10.0, 20.0)
     volume = fdk(ball_views(geometry, 1.0, (0, 0, 0)), geometry, Grid((21, 8, 8), 0.05))
