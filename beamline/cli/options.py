@@ -29,7 +29,8 @@ from recon.methods import METHODS
 def _within(bounds: click.FloatRange | click.IntRange, number: Any, *place: Any) -> Any:
     """The number, where it is within the bounds; else it is refused in the words of a declared value."""
     low, high = "gt" if bounds.min_open else "ge", "lt" if bounds.max_open else "le"
-    if fault := Setting(**{low: bounds.min, high: bounds.max}).fault(number):
+    limits: dict[str, Any] = {low: bounds.min, high: bounds.max}
+    if fault := Setting(**limits).fault(number):
         bounds.fail(f"{number}; {fault}.", *place)
     return number
 

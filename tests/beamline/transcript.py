@@ -67,7 +67,7 @@ def world() -> Path:
         write_exchange(folder / f"{name}.h5", SCAN, changes)
     np.savez(folder / "volume.npz", data=np.zeros((4, 5, 6), np.float32))
     for name, volume in VOLUMES.items():
-        np.save(folder / f"{name}.npy", volume)
+        np.save(folder / f"{name}.npy", np.asarray(volume))
     tifffile.imwrite(folder / "in.tif", SCAN.line_integrals().astype(np.float32), photometric="minisblack")
     np.savetxt(folder / "angles.txt", np.degrees(SCAN.angles))
     (folder / "text.h5").write_text("no scan")
