@@ -45,6 +45,9 @@ SKEW = 0.5  # s by which the clocks of two IOCs may differ and still count as se
 class Guide(Protocol):
     """Tells what a scan plans, and of each frame its kind and angle. It only reads."""
 
+    def begin(self, first_id: int | None) -> None:
+        """Another file begins. `first_id`: number of its first projection; None: that of the first one that comes."""
+
     def plan(self) -> RidePlan:
         """The plan as it stands now. ConfigError where it cannot be."""
 
@@ -67,13 +70,16 @@ class Guide(Protocol):
 class _Kinds:
     """The kinds of frames by an attribute, each change of which begins a block; without one, by the planned order."""
 
-    def __init__(self, name: str | None, blocks: Sequence[PlannedBlock], first_id: int | None = None) -> None:
-        before = sum(block.n for block in blocks[: [*(block.kind for block in blocks), _VIEWS].index(_VIEWS)])
+    def __init__(self, name: str | None, blocks: Sequence[PlannedBlock]) -> None:
+        self._before = sum(block.n for block in blocks[: [*(block.kind for block in blocks), _VIEWS].index(_VIEWS)])
         self._name, self._phase = name, NO_SCAN
-        self._first = math.nan if first_id is None else first_id - before
-        self._last = -1
+        self.begin(None)
         self._ends = np.cumsum([block.n for block in blocks])
         self._kinds = [*(block.kind for block in blocks), None]
+
+    def begin(self, first_id: int | None) -> None:
+        """See `Guide`."""
+        self._first, self._last = math.nan if first_id is None else first_id - self._before, -1
 
     def __call__(self, frame: ArrayFrame) -> Phase:
         if self._name is None:
@@ -114,7 +120,8 @@ class _ByNumbers:
         before = [PlannedBlock(kind, each.count) for kind, each in fields if each.count and each.at in _BEFORE]
         after = [PlannedBlock(kind, each.count) for kind, each in fields if each.count and each.at in _AFTER]
         self._blocks = (*before, PlannedBlock(FrameKind.PROJECTION, len(angles)), *after[::-1])
-        self._kinds = _Kinds(ride.kinds, self._blocks, ride.first_id)
+        self._kinds = _Kinds(ride.kinds, self._blocks)
+        self.begin = self._kinds.begin
 
     def plan(self) -> RidePlan:
         seconds = {
@@ -233,6 +240,9 @@ class TomoscanGuide:
     @property
     def status(self) -> str:
         return self._variables.text("ScanStatus")
+
+    def begin(self, first_id: int | None) -> None:
+        pass
 
     def plan(self) -> RidePlan:
         number, text = self._variables.number, self._variables.text

@@ -77,8 +77,11 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> list[RunResul
         BeamlineError, DeviceError: as `record_scan`.
     """
     results, lost = list[RunResult](), None
+    settings = ride.config.ride
+    first_id = settings.first_id
     while True:
-        first = wait_for_scan(ride)
+        ride.guide.begin(first_id)
+        first = wait_for_scan(ride, first_id)
         refuse_mistakes(ride.config, ride.counters, first)
         own = _with_exposure(ride.guide.plan(), ride, first)
         plan = _with_given(own, ride.given, first.window.shape)
@@ -86,12 +89,10 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> list[RunResul
         command = _follow(ride.config, first, plan) if live else None
         frames: list[RiddenFrames] = []
 
-        def source_of(measurement: Measurement, own: RidePlan = own, frames: list[Any] = frames) -> RiddenFrames:
-            settings = ride.config.ride
-            journey = Journey(
-                ride.stream, ride.guide, own, ride.counters, ride.given, settings.first_id, settings.silence_s
-            )
-            frames.append(RiddenFrames(journey, measurement))
+        by = Journey(ride.stream, ride.guide, own, ride.counters, ride.given, first_id, settings.silence_s)
+
+        def source_of(measurement: Measurement, by: Journey = by, frames: list[Any] = frames) -> RiddenFrames:
+            frames.append(RiddenFrames(by, measurement))
             return frames[-1]
 
         instrument = _instrument()
@@ -107,6 +108,7 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> list[RunResul
             if lost is not None:
                 raise lost
             return results
+        first_id = None  # numbers of another epoch
 
 
 def _instrument() -> ConnectedDevices:
@@ -121,7 +123,7 @@ def _follow(config: RideConfig, first: ArrayFrame, plan: RidePlan) -> LiveComman
     return follow_command(config, live_plan(first.window.shape, plan.angles.size, free_memory()))
 
 
-def wait_for_scan(ride: Ride) -> ArrayFrame:
+def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
     """The first frame of a scan, which the stream still has; those before it are dropped.
 
     Raises:
@@ -140,12 +142,14 @@ def wait_for_scan(ride: Ride) -> ArrayFrame:
             raise ConfigError(f"Frames of {stream.name} cannot be stored: {item.why}. Nothing was recorded.")
         if isinstance(item, ArrayFrame):
             since = clock.now()
+            if item.is_current:  # it was there before
+                continue
             kind = guide.phase(item).kind
-            early = kind is FrameKind.PROJECTION and item.unique_id < (settings.first_id or 0)
-            if kind is not None and not item.is_current and not early:
+            early = kind is FrameKind.PROJECTION and item.unique_id < (first_id or 0)
+            if kind is not None and not early:
                 stream.put_back(item)
                 return item
-            if not (item.is_current or told):
+            if not told:
                 told = True
                 status = f" ({guide.status})" if guide.status else ""
                 ride.say(f"Frames of no scan come{status}: they are not stored.")

@@ -18,7 +18,7 @@ from beamline.core.errors import ConfigError
 from drivers.base.errors import DeviceTimeout
 
 Value = float | str
-_ANSWER = 3.0  # s
+_ANSWER, _OTHERS = 3.0, 1.5  # s, for variables that are needed, and for others
 _LONGEST_DELAY = 60.0  # s: an IOC whose clock is off by more has none that is set
 
 
@@ -105,7 +105,8 @@ class Variables:
                 f'{url} needs the library {error.name}: pip install "splatline[areadetector]". Nothing was started.'
             ) from error
         with self._came:
-            self._came.wait_for(lambda: not self._silent(needed or names), _ANSWER if needed or names else 0)
+            self._came.wait_for(lambda: not self._silent(needed), _ANSWER)
+            self._came.wait_for(lambda: not self._silent(names), _OTHERS)
         if silent := self._silent(needed):
             self.close()
             raise DeviceTimeout(
