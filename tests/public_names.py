@@ -92,8 +92,8 @@ FOR_PACKAGES = {
     "drivers.base.errors": ("DeviceError", "DeviceRefused", "DeviceTimeout"),
     "drivers.base.frame": ("Frame", "FrameKind"),
     "drivers.base.protocols": (
-        "Camera", "CameraFrame", "CameraSettings", "CameraTiming", "Devices", "RotationStage", "StageLimits", "TriggerSource",
-        "TriggerTrain",
+        "Camera", "CameraFrame", "CameraSettings", "CameraTiming", "Devices", "RotationStage", "StageLimits",
+        "TriggerSource", "TriggerTrain",
     ),
     "beamline.config.devices": ("CameraDriver",),
     "drivers.stages.settings": ("StageDriver", "StageSettings"),
@@ -147,7 +147,7 @@ def required(value: Any, *, method: bool = False) -> str:
     Args:
         method: leave the first one out.
     """
-    if not callable(value) or (inspect.isclass(value) and not _has_parameters(value)):
+    if not callable(value) or hasattr(value, "__origin__") or (inspect.isclass(value) and not _has_parameters(value)):
         return ""
     parameters = list(inspect.signature(value).parameters.values())[1 if method else 0 :]
     needed = [each for each in parameters if each.default is each.empty and each.kind not in _SEVERAL]
