@@ -218,7 +218,10 @@ def test_a_ride_that_is_killed_is_recovered(tmp_path: Path, scan: Path) -> None:
         ride.process.kill()
         ride.end()
     (run,) = (tmp_path / "runs").glob("*/")
-    subprocess.run([sys.executable, "-m", "beamline.cli.main", "recover", str(run)], check=True, capture_output=True)
+    time.sleep(10)  # for so long a file counts as being written
+    command = [sys.executable, "-m", "beamline.cli.main", "recover", str(run)]
+    recovered_by = subprocess.run(command, capture_output=True, text=True)
+    assert recovered_by.returncode == 0, recovered_by.stderr
     (file,) = stored(tmp_path)
     _equal_to_the_bit(file, scan)
     assert file.ids.tolist() == [*range(1, len(file.ids) + 1)] and len(file.ids) >= committed
