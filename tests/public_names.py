@@ -53,7 +53,7 @@ FOR_PACKAGES = {
     "beamline.projections.prepare": ("prepare_projections",),
     "beamline.projections.protocols": ("PlaceStep", "ScanPart", "ScanStep", "ViewStep"),
     "beamline.projections.step": ("StepDone", "StepMemory", "option"),
-    "beamline.storage.hdf5": ("created", "open_hdf5", "readable"),
+    "beamline.storage.hdf5": ("created", "look_again", "open_hdf5", "readable"),
     "beamline.storage.frame_table": ("FrameTable",),
     "beamline.storage.readers.base": ("WHOLE", "ScanFormat", "ScanSource", "frame_indices"),
     "beamline.storage.readers.open": ("open_scan",),
