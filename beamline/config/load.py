@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
@@ -27,6 +27,7 @@ from beamline.config.models import (
     SectorAngles,
 )
 from beamline.config.rehearsal import rehearsal
+from beamline.config.section import Section
 from beamline.config.tree import Tree, explain, override, read
 from beamline.core.errors import ConfigError
 from beamline.core.files import SETTINGS, kind_of_data, text_in
@@ -37,6 +38,8 @@ from beamline.plan import plan as plans
 from beamline.plan.plan import FieldPlan, Mode, ScanPlan
 from drivers.base.protocols import CameraSettings, TriggerSource
 from recon.base.findings import declared_at
+
+AnySection = TypeVar("AnySection", bound=Section)
 
 NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
@@ -68,20 +71,7 @@ def load(
         ConfigError: every fault with file, line, key, what was found and what is legal. Nothing has been started.
     """
     path = Path(path)
-    try:
-        text = text_in(path, SETTINGS)
-    except FileNotFoundError:
-        raise ConfigError(
-            f"{path} does not exist; `beamline config init > my.yaml` creates a configuration to edit."
-        ) from None
-    except OSError as error:
-        if (kind := kind_of_data(path)) is not None:
-            raise ConfigError(
-                f"{path} is {kind}, not a configuration: `beamline info {path}` says what it holds. Nothing was "
-                "started."
-            ) from None
-        raise ConfigError(f"{path} cannot be read: {error.strerror}. Nothing was started.") from None
-    tree = read(text, str(path))
+    tree = _read_file(path, "beamline config init")
     _locate(tree.data, path.parent)
     tree = override(tree, overrides, os.environ if environment is None else environment, takes_text)
     if no_live is not None:
@@ -93,9 +83,40 @@ def load(
     return _validated(Tree(rehearsal(config), tree.origins), str(path)) if rehearse else config
 
 
-def takes_text(keys: Sequence[str]) -> bool:
-    """Whether a key of the configuration accepts any text, and nothing else but null."""
-    legal = declared_at(schema(), tuple(keys), None)
+def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), *, printed_by: str) -> AnySection:
+    """Read and validate a configuration of another package, as `load` does one of a scan; no variable overrides it.
+
+    Args:
+        printed_by: the command that prints an example.
+    """
+    legal = model.model_json_schema()
+    tree = override(_read_file(path, printed_by), overrides, {}, lambda keys: takes_text(keys, legal))
+    try:
+        return model.model_validate(tree.data)
+    except ValidationError as error:
+        _refuse(str(path), explain(error, tree, legal))
+        raise
+
+
+def _read_file(path: Path, printed_by: str) -> Tree:
+    try:
+        text = text_in(path, SETTINGS)
+    except FileNotFoundError:
+        raise ConfigError(f"{path} does not exist; `{printed_by} > my.yaml` creates a configuration to edit.") from None
+    except OSError as error:
+        if (kind := kind_of_data(path)) is not None:
+            raise ConfigError(
+                f"{path} is {kind}, not a configuration: `beamline info {path}` says what it holds. Nothing was "
+                "started."
+            ) from None
+        raise ConfigError(f"{path} cannot be read: {error.strerror}. Nothing was started.") from None
+    return read(text, str(path))
+
+
+def takes_text(keys: Sequence[str], of: Mapping[str, Any] | None = None) -> bool:
+    """Whether a key of the configuration accepts any text, and nothing else but null; `of`: the JSON schema of
+    another one."""
+    legal = declared_at(schema() if of is None else of, tuple(keys), None)
     kinds = {None if "enum" in each or "const" in each else each.get("type") for each in legal}
     return "string" in kinds and kinds <= {"string", "null"}
 
@@ -158,7 +179,7 @@ def _refuse(path: str, found: Sequence[str]) -> None:
         raise ConfigError(f"{path} has {len(found)} faults, nothing was started:{lines}") from None
 
 
-def resolved_yaml(config: Config) -> str:
+def resolved_yaml(config: Section) -> str:
     """The whole configuration with every default filled in; the version on line one. `load` reads it back."""
     body = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True, width=120)
     return f"# splatline {version()}\n{body}"

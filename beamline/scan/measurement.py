@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol
 
 from beamline.config.load import Config
 from beamline.config.monitor import policies
@@ -28,7 +29,7 @@ from beamline.scan.decider import Decider
 from beamline.scan.flagged import AlarmReaction, FlaggedFrames
 from beamline.scan.ledger import LedgerError
 from beamline.scan.live_process import LiveReconstruction, live_should_end
-from beamline.scan.moves import SAFE, UNSAFE
+from beamline.scan.moves import SAFE, UNSAFE, WRITTEN
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.recorder import Recorder
 from beamline.scan.references import REFERENCES, ReferenceReport
@@ -36,10 +37,30 @@ from beamline.scan.resume import ResumableRun
 from beamline.scan.supervision import PAUSE_POLL, BeamLog, Supervision, beam_log
 from beamline.simulate import LabelLog, labels_path, write_labels
 from beamline.storage.writers.nxtomo import NXtomoWriter
+from drivers.base.frame import Frame
 
 READY_WITHIN = 300.0
 """Real s that a scan waits for its live reconstruction, which compiles once on a machine: before its first frame. A
 simulated one, whose references do not age, waits before its first view."""
+
+
+class FrameSource(Protocol):
+    """Delivers the frames of a scan, as `Acquisition` does on our devices.
+
+    Attributes, to be read after the last frame:
+        missing: triggers, counted over the whole plan, that gave no frame.
+        recovered: views that gave no frame at first, but when they were repeated.
+        unsafe: a device failed while the instrument was made safe.
+    """
+
+    recovered: int
+    unsafe: bool
+
+    @property
+    def missing(self) -> list[int]: ...
+
+    def frames(self) -> Generator[Frame, None, None]:
+        """The frames in the order of the file. Raises LedgerError after the last one if some are missing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +70,7 @@ class Measurement:
     Attributes:
         began: when the run did, on the monotonic clock.
         series: the run that goes on, if one does.
+        source_of: makes what delivers the frames where others control the scan; None: we do, with the devices.
     """
 
     config: Config
@@ -59,6 +81,7 @@ class Measurement:
     sink: Sink
     began: float
     series: ResumableRun | None
+    source_of: Callable[[Measurement], FrameSource] | None = None
     pause: PauseRequest = field(default_factory=PauseRequest)
 
     @cached_property
@@ -89,7 +112,7 @@ class Measurement:
             states=self.states,
             stop=self.stop,
             sink=self.sink,
-            added_seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES)
+            added_seconds=sum(seconds_of(block) for block in after if block.kind in REFERENCES and scan.decide != "off")
             + (self.series.seconds if self.series else 0.0),
             retaken=self.series.retaken if self.series else 0,
             number=len(timeline.plan.choices),
@@ -127,12 +150,16 @@ class Measurement:
     ) -> RunResult:
         recorder = self._recorder(writer)
         beam = beam_log(self.config.devices.beam_monitor, self.instrument.beam_monitor, self.sink, self.pause)
-        acquisition = self._acquisition(recorder, beam, follower)
+        acquisition: FrameSource = (
+            self._acquisition(recorder, beam, follower) if self.source_of is None else self.source_of(self)
+        )
         labels = LabelLog()
         ended = _Ending(self.sink)
         with ended.kept(), beam:
             self._acquire(acquisition, recorder, labels, follower)
-        self.states.enter(State.FINISHING, UNSAFE if acquisition.unsafe else SAFE)
+        self.states.enter(
+            State.FINISHING, UNSAFE if acquisition.unsafe else SAFE if self.source_of is None else WRITTEN
+        )
         with ended.kept():
             recorder.finish()
         faults = self.references.faults(recorder.references)
@@ -179,9 +206,9 @@ class Measurement:
         return replace(result, seconds=time.monotonic() - self.began)
 
     def _acquire(
-        self, acquisition: Acquisition, recorder: Recorder, labels: LabelLog, follower: LiveReconstruction | None
+        self, acquisition: FrameSource, recorder: Recorder, labels: LabelLog, follower: LiveReconstruction | None
     ) -> None:
-        if self.config.simulation is None and follower is not None:
+        if self.config.simulation is None and follower is not None and self.source_of is None:
             follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
         # Closing the iterator is what makes the instrument safe when the recorder fails.
         with closing(acquisition.frames()) as frames:

@@ -17,7 +17,8 @@ from drivers.base.errors import DeviceError
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import Devices, Rechecked, RotationStage
 
-SAFE = "Stage stopped, shutter closed; the last frames are being written"  # Message of the state `finishing`
+WRITTEN = "The last frames are being written"  # Message of the state `finishing`
+SAFE = "Stage stopped, shutter closed; the last frames are being written"  # The same with devices of ours
 UNSAFE = (
     "Stage, camera or shutter did not obey at the end: look at the instrument before anybody goes near the beam; "
     "the last frames are being written"

@@ -275,15 +275,27 @@ def preflight(
     free = shutil.disk_usage(disk).free
     timeline = _lockable(_worked(config, plan, stage.limits, stage.to_counts, timing, free), disk)
     refuse_violations(timeline)
-    info = _info(config, instrument, plan, timeline)
-    monitor = start_monitor(_context(plan, timeline, timing, info), configured_checks(config.monitor))
+    ready = ready_scan(config, timeline, settings, timing, _info(config, instrument, plan, timeline), check_stop)
+    if instrument.simulated is not None:
+        instrument.simulated.rehearse()
+    return ready
+
+
+def ready_scan(
+    config: Config,
+    timeline: Timeline,
+    settings: CameraSettings,
+    timing: CameraTiming,
+    info: ScanInfo,
+    check_stop: Callable[[], None] = lambda: None,
+) -> ReadyScan:
+    """A planned scan with the monitor before its first frame; sections `monitor` and `storage` of `config` count."""
+    monitor = start_monitor(_context(timeline.plan, timeline, timing, info), configured_checks(config.monitor))
     # The first call compiles, which must not happen while frames are coming.
     check_stop()
     digests(np.zeros(timing.shape, np.uint16), monitor.context.saturation, config.storage.preview_bin)
     check_stop()
-    if instrument.simulated is not None:
-        instrument.simulated.rehearse()
-    return ReadyScan(plan, timeline, settings, timing, monitor, info)
+    return ReadyScan(timeline.plan, timeline, settings, timing, monitor, info)
 
 
 def _context(plan: ScanPlan, timeline: Timeline, timing: CameraTiming, info: ScanInfo) -> ScanContext:

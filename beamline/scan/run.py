@@ -27,7 +27,7 @@ from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import ConnectedDevices, clock_after, connect
 from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
 from beamline.scan.live_process import LiveCommand, reconstruct
-from beamline.scan.measurement import Measurement
+from beamline.scan.measurement import FrameSource, Measurement
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.resume import ResumableRun
 from beamline.scan.runs import record_sink
@@ -99,6 +99,39 @@ def run_scan(
                 guarded.enter_context(watched(folder, sink, stop, without))
             guarded.callback(connected.close)
             return _to_its_end(measurement, live, afterwards, guarded.close)
+
+
+def record_scan(
+    config: Config,
+    ready: ReadyScan,
+    source_of: Callable[[Measurement], FrameSource],
+    runs: Path,
+    sinks: Sequence[Sink],
+    stop: StopRequest,
+    *,
+    instrument: ConnectedDevices,
+    live: LiveCommand | None = None,
+) -> RunResult:
+    """Record a scan that others control, in a run folder of its own, as `run_scan` does one of ours.
+
+    Nothing waits for the live reconstruction, no watchdog runs, and no device is operated.
+
+    Args:
+        config: its sections sample, storage, monitor, references, scan and devices.beam_monitor count.
+        source_of: makes what delivers the frames, from the measurement that takes them.
+        runs: the folder in which the run gets its own.
+        instrument: has the clock.
+
+    Raises:
+        LedgerError: frames are missing. ScanStopped, ScanAborted: it was requested. DataError: the disk failed.
+    """
+    began = time.monotonic()
+    with ExitStack() as stack:
+        folder = create_run_folder(runs, config.sample.name, SystemClock().now())
+        sink = _announcing(config, ready, folder, instrument.clock, sinks, stack)
+        measurement = Measurement(config, instrument, ready, folder, stop, sink, began, None, source_of)
+        stack.enter_context(verbs_taken(folder, stop, measurement.pause))
+        return _to_its_end(measurement, live, None, lambda: None)
 
 
 def _announcing(

@@ -1,1 +1,1 @@
-"""Cameras behind EPICS areaDetector."""
+"""Cameras behind EPICS areaDetector: somebody else's scan recorded as one of ours, and ours served to others."""

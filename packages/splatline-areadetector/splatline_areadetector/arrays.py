@@ -1,0 +1,148 @@
+"""Frames of areaDetector as values: an NTNDArray becomes pixels [row, col] with number, time, window and attributes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatline_areadetector.codecs import ELEMENTS, NAMES, decoded
+
+_MONO = 0
+_COLOURS = {1: "Bayer", 2: "RGB1", 3: "RGB2", 4: "RGB3", 5: "YUV444", 6: "YUV422", 7: "YUV421"}
+COUNTS = (np.dtype(np.uint8), np.dtype(np.uint16))
+
+
+class FrameRefusedError(ValueError):
+    """Frames of this kind cannot be stored as counts; the message says what to change."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """The part of the sensor that a frame shows, cumulative over the plugins it passed.
+
+    Attributes:
+        shape: rows and columns of the frame.
+        offset: (row, col) of its first pixel, in unbinned pixels of the sensor.
+        binning: sensor pixels a pixel, by row and column.
+        reverse: whether rows and columns run the other way.
+    """
+
+    shape: tuple[int, int]
+    offset: tuple[int, int] = (0, 0)
+    binning: tuple[int, int] = (1, 1)
+    reverse: tuple[bool, bool] = (False, False)
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayFrame:
+    """One NTNDArray, copied out of the message; its pixels are decoded when they are asked for.
+
+    Attributes:
+        unique_id: the driver's number of the frame, usually from 1 at the start of an acquisition.
+        time: s since the Unix epoch, at which the driver had the frame, after readout.
+        received: s on this computer's monotonic clock.
+        attributes: NDAttributes by name.
+        is_current: the value that the server had when it was connected: an old frame, unless its number is new.
+        codec: "" for raw pixels.
+    """
+
+    payload: NDArray[Any]
+    dtype: np.dtype[Any]
+    window: Window
+    unique_id: int
+    time: float
+    received: float = math.nan
+    codec: str = ""
+    attributes: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    is_current: bool = False
+
+    @property
+    def kind(self) -> tuple[Window, np.dtype[Any]]:
+        """What does not change within a file."""
+        return self.window, self.dtype
+
+    @property
+    def n_bytes(self) -> int:
+        """Of the message's pixels, as they are held in memory."""
+        return self.payload.nbytes
+
+    def counts(self) -> NDArray[np.uint16]:
+        """uint16 [row, col]. ValueError where a compressed frame is damaged."""
+        if not self.codec:
+            return self.payload.reshape(self.window.shape).astype(np.uint16, copy=False)
+        return decoded(self.codec, self.payload, self.window.shape, self.dtype).astype(np.uint16, copy=False)
+
+
+def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayFrame | None:
+    """The frame of an NTNDArray that p4p has delivered with `nt=False`; None: it holds no pixels yet.
+
+    Raises:
+        FrameRefusedError: colour, signed or real pixels, JPEG, or another codec or number of dimensions.
+    """
+    pixels = value.value
+    if pixels is None or len(value.dimension) == 0:
+        return None
+    attributes = {each.name: each.value for each in value.attribute}
+    codec, sizes = str(value.codec.name), [int(each.size) for each in value.dimension]
+    _refuse_colour(attributes, sizes)
+    if codec and codec not in NAMES:
+        raise FrameRefusedError(
+            f"its pixels are compressed by {codec}, which "
+            + ("does not keep counts" if codec == "jpeg" else "this program does not know")
+            + f"; set Codec1:Compressor to one of {', '.join(NAMES)}, or take the image before that plugin"
+        )
+    # A codec's parameters are an `any`: an int with pvDatabase's servers, None without a codec.
+    element = ELEMENTS.get(int(value.codec.parameters or 0), "") if codec else pixels.dtype.str[1:]
+    dtype = np.dtype(element) if element else np.dtype(np.float64)
+    _refuse_type(dtype, codec, element)
+    stamp = value.timeStamp
+    window = _window(value.dimension)
+    if not codec and pixels.size != math.prod(window.shape):
+        raise FrameRefusedError(f"it has {pixels.size} pixels, and its dimensions say {window.shape}")
+    return ArrayFrame(
+        np.array(pixels),  # a view into the message, which the next one overwrites
+        dtype,
+        window,
+        int(value.uniqueId),
+        stamp.secondsPastEpoch + 1e-9 * stamp.nanoseconds,
+        received,
+        codec,
+        attributes,
+        is_current,
+    )
+
+
+def _refuse_colour(attributes: Mapping[str, Any], sizes: list[int]) -> None:
+    mode = attributes.get("ColorMode", _MONO)
+    if mode != _MONO or len(sizes) != 2:
+        what = _COLOURS.get(mode, f"ColorMode {mode}") if mode != _MONO else f"of {len(sizes)} dimensions"
+        raise FrameRefusedError(
+            f"its pixels are {what}, not mono; set cam1:ColorMode to Mono (of a 3D array: a plugin before makes it)"
+        )
+
+
+def _refuse_type(dtype: np.dtype[Any], codec: str, element: str) -> None:
+    if codec and not element:
+        raise FrameRefusedError(f"its codec {codec} does not say the type of its pixels")
+    if dtype not in COUNTS:
+        raise FrameRefusedError(
+            f"its pixels are {dtype}, and counts are uint8 or uint16; set cam1:DataType (or the DataType of the last "
+            "plugin that computes, such as Proc1) to UInt16"
+        )
+
+
+def _window(dimension: Any) -> Window:
+    """dimension[0] is x, the fastest."""
+    x, y = dimension
+    return Window(
+        (int(y.size), int(x.size)),
+        (int(y.offset), int(x.offset)),
+        (int(y.binning) or 1, int(x.binning) or 1),
+        (bool(y.reverse), bool(x.reverse)),
+    )
