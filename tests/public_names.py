@@ -69,6 +69,7 @@ FOR_PACKAGES = {
         "TriggerTrain",
     ),
     "beamline.config.devices": ("CameraDriver",),
+    "drivers.epics.channel": ("ProcessVariable", "open_channel"),
     "drivers.stages.settings": ("StageDriver", "StageSettings"),
     "drivers.testing.camera": ("CameraConformance",),
     "drivers.testing.stages": ("StageConformance", "StepStageConformance"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -71,9 +72,8 @@ class ImageServer:
         self._image = SharedPV(initial=self._type.type())
         self._provider = StaticProvider("image")
         self._provider.add(name, self._image)
-        conf = {"EPICS_PVAS_INTF_ADDR_LIST": address} | ({} if port is None else {"EPICS_PVAS_SERVER_PORT": f"{port}"})
         try:
-            self._server = Server(providers=[self._provider], conf=conf)
+            self._server = Server(providers=[self._provider], conf=_configured(address, port), useenv=False)
         except RuntimeError as error:
             raise DataError(f"{address} cannot be listened at: {error}. Nothing was started.") from error
         self.port = int(self._server.conf()["EPICS_PVAS_SERVER_PORT"])
@@ -113,3 +113,12 @@ class ImageServer:
 
     def close(self) -> None:
         self._server.stop()
+
+
+def _configured(address: str, port: int | None) -> dict[str, str]:
+    """The environment of EPICS with this address and port in place of its own, to which p4p would add them."""
+    conf = {name: value for name, value in os.environ.items() if name.startswith("EPICS_PVA")}
+    for name in ("EPICS_PVAS_INTF_ADDR_LIST", "EPICS_PVA_INTF_ADDR_LIST"):
+        conf.pop(name, None)
+    ports = {} if port is None else dict.fromkeys(("EPICS_PVAS_SERVER_PORT", "EPICS_PVA_SERVER_PORT"), f"{port}")
+    return conf | ports | {"EPICS_PVAS_INTF_ADDR_LIST": address}

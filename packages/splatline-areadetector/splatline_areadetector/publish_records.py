@@ -28,7 +28,7 @@ class RecordServer:
         self, prefix: str, records: Sequence[Record], address: str, asked: Callable[[str, Value], None]
     ) -> None:
         os.environ["EPICS_CAS_INTF_ADDR_LIST"] = os.environ["EPICS_PVAS_INTF_ADDR_LIST"] = address
-        os.environ["EPICS_PVAS_SERVER_PORT"] = "0"  # that of the image is taken
+        os.environ["EPICS_PVAS_SERVER_PORT"] = os.environ["EPICS_PVA_SERVER_PORT"] = "0"  # the image has the usual one
         try:
             from softioc import asyncio_dispatcher, builder, softioc
         except ImportError as error:
