@@ -65,6 +65,10 @@ class _Records:
     def set(self, record: str, value: float | str, within: float = 0.01) -> float | str:
         """Write a value, and wait for its readback; a number may differ by this share. The readback."""
         self.write(record, value)
+        return self.await_value(record, value, within)
+
+    def await_value(self, record: str, value: float | str, within: float = 0.01) -> float | str:
+        """Wait until the readback is this value. Raises DeviceRefused if it does not come to be."""
         deadline = self._clock.now() + self._timeout
         while not _is_near(shown := self.read(f"{record}_RBV"), value, within):
             if self._clock.now() > deadline:
@@ -147,8 +151,6 @@ class AreaDetectorCamera:
             raise ValueError(f"roi {list(wanted.roi or ())} reaches beyond the sensor of {rows} x {cols} pixels")
         if height % wanted.binning or width % wanted.binning:
             raise ValueError(f"{height} x {width} pixels are not divided by binning {wanted.binning}")
-        if wanted.trigger not in (triggers := DRIVERS[settings.driver].triggers):
-            raise ValueError(f"{settings.driver} takes no {wanted.trigger} triggers here; legal: {', '.join(triggers)}")
         shape = height // wanted.binning, width // wanted.binning
         period = max(settings.min_period, wanted.exposure + settings.dead)
         return CameraTiming(shape, period, settings.readout, settings.row_period, settings.bits)
@@ -189,11 +191,13 @@ class AreaDetectorCamera:
             raise DeviceRefused(self.name, "it is armed already", advice="disarm() it first")
         if n_frames < 1:
             raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
-        labels, endless = self._labels, self._settings.trigger is not TriggerSource.INTERNAL
+        labels, trigger = self._labels, self._settings.trigger
         self._await_silence()
-        for record in labels.armed:
-            self._records.set(f"cam1:{record}", n_frames if endless else 1)
-        self._records.set("cam1:NumImages", 1 if labels.armed and endless else n_frames)
+        by_pulse = trigger is TriggerSource.EXTERNAL
+        if labels.train:
+            self._records.set(f"cam1:{labels.train}", n_frames if by_pulse else 1)
+        in_one = trigger is TriggerSource.INTERNAL or (by_pulse and not labels.train)
+        self._records.set("cam1:NumImages", n_frames if in_one else 1)
         if labels.counted:
             self._records.set("cam1:ArrayCounter", 0)
         rows, cols = self.timing.shape
@@ -204,7 +208,8 @@ class AreaDetectorCamera:
             self._problem, self._origin = None, 1 if labels.counted else None
             self._armed = True
         try:
-            self._records.set("cam1:Acquire", 1)
+            if labels.fire or trigger is not TriggerSource.SOFTWARE:
+                self._records.set("cam1:Acquire", 1)
         except BaseException:
             self._armed = False
             raise
@@ -215,7 +220,11 @@ class AreaDetectorCamera:
             armed = "armed" if self._armed else "not armed"
             problem = f"it accepts no software trigger ({armed}, trigger {self._settings.trigger})"
             raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
-        self._records.write(f"cam1:{self._labels.fire}", 1)
+        if self._labels.fire:
+            self._records.write(f"cam1:{self._labels.fire}", 1)
+        else:
+            self._records.await_value("cam1:Acquire", 0)  # of the frame before
+            self._records.write("cam1:Acquire", 1)
 
     def next_frame(self, timeout: float) -> CameraFrame:
         """The oldest frame not yet taken.

@@ -17,6 +17,8 @@ _MODES: Mapping[TriggerSource, str] = {
     TriggerSource.INTERNAL: "Multiple", TriggerSource.EXTERNAL: "Continuous", TriggerSource.SOFTWARE: "Continuous",
 }  # fmt: skip
 
+_SINGLE = {**_MODES, TriggerSource.SOFTWARE: "Single"}
+
 
 @dataclass(frozen=True)
 class DriverLabels:
@@ -24,11 +26,11 @@ class DriverLabels:
 
     Attributes:
         triggers: for each source that it has; {line}: as configured.
-        fire: the record that exposes a frame by software.
+        fire: the record that exposes a frame by software; "": each is an acquisition of one frame.
         modes: ImageMode for each source; None: it has no such record.
         counted: frames are numbered from 1 by ArrayCounter, which is set to 0 before; else by the camera, from its
             first.
-        armed: records that take the number of triggers, before it acquires.
+        train: the record that takes the number of external triggers, each of one image; "": it needs none.
         binning: a label of A3Binning, in place of BinX and BinY.
         binned_region: SizeX and SizeY are in binned pixels.
     """
@@ -37,14 +39,14 @@ class DriverLabels:
     fire: str = ""
     modes: Mapping[TriggerSource, str] | None = field(default_factory=lambda: MappingProxyType(_MODES))
     counted: bool = True
-    armed: tuple[str, ...] = ()
+    train: str = ""
     binning: str = ""
     binned_region: bool = False
 
 
-def _by_mode(internal: str, external: str, software: str = "") -> Mapping[TriggerSource, Writes]:
+def _by_mode(internal: str, external: str, software: str) -> Mapping[TriggerSource, Writes]:
     labels = {TriggerSource.INTERNAL: internal, TriggerSource.EXTERNAL: external, TriggerSource.SOFTWARE: software}
-    return {source: {"TriggerMode": label} for source, label in labels.items() if label}
+    return {source: {"TriggerMode": label} for source, label in labels.items()}
 
 
 def _by_genicam() -> Mapping[TriggerSource, Writes]:
@@ -66,15 +68,15 @@ def _by_hamamatsu() -> Mapping[TriggerSource, Writes]:
 
 DRIVERS: Mapping[str, DriverLabels] = {
     "spinnaker": DriverLabels(_by_genicam(), fire="TriggerSoftware", counted=False, binned_region=True),
-    "simdetector": DriverLabels(_by_mode("Internal", "External")),
-    "pco": DriverLabels(_by_mode("Auto", "Ext Only")),
+    "simdetector": DriverLabels(_by_mode("Internal", "External", "Internal"), modes=_SINGLE),
+    "pco": DriverLabels(_by_mode("Auto", "Ext Only", "Auto"), modes=_SINGLE),
     "andor3": DriverLabels(
         _by_mode("Internal", "External", "Software"), fire="SoftwareTrigger",
         modes={**_MODES, TriggerSource.INTERNAL: "Fixed"}, binning="{0}x{0}",
     ),
     "hamamatsu": DriverLabels(_by_hamamatsu(), fire="HamaFireTrigger", counted=False),
     "eiger": DriverLabels(
-        _by_mode("Internal Series", "External Series"), modes=None, armed=("NumTriggers",),
+        _by_mode("Internal Series", "External Series", "Internal Series"), modes=None, train="NumTriggers",
     ),
 }  # fmt: skip
 """By the name that a configuration gives the driver."""

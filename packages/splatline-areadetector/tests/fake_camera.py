@@ -110,6 +110,10 @@ class FakeCamera:
                     counts = np.full((rows, cols), self.frames, np.uint16)
                     stamp = at + self.exposure + READOUT + rng.uniform(0, LATEST)
                     image.post(PublishedFrame(counts, number, FrameKind.PROJECTION, 0.0, stamp, self.exposure))
+                    if self.values["cam1:ImageMode"] == "Single":
+                        self.begun = math.inf
+                        server.put("cam1:Acquire", 0)
+                        server.put("cam1:Acquire_RBV", 0)
 
     @property
     def exposure(self) -> float:
@@ -126,8 +130,8 @@ class FakeCamera:
         """Expose for what has come by now."""
         mode, period = self.values["cam1:TriggerMode"], self.exposure + DEAD
         if mode in ("Off", "Internal"):
-            due = min(int((now - self.begun) / period), int(self.values["cam1:NumImages"]))
-            done = self.frames + len(self.exposed)
+            wanted = 1 if self.values["cam1:ImageMode"] == "Single" else int(self.values["cam1:NumImages"])
+            due, done = min(int((now - self.begun) / period) + 1, wanted), self.frames + len(self.exposed)
             self.exposed += [self.begun + k * period for k in range(done, due)]
             return
         if mode == "Software" or (mode == "On" and self.values["cam1:TriggerSource"] == "Software"):

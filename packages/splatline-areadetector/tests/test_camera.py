@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
+from beamline.config.load import load
 from beamline.core.errors import ConfigError
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
@@ -72,6 +74,7 @@ def _fixture(driver: str) -> Callable[..., Iterator[FakeIoc]]:
 
 
 spinnaker = pytest.fixture(scope="module", name="spinnaker")(_fixture("spinnaker"))
+simdetector = pytest.fixture(scope="module", name="simdetector")(_fixture("simdetector"))
 andor3 = pytest.fixture(scope="module", name="andor3")(_fixture("andor3"))
 
 
@@ -94,3 +97,124 @@ class TestAndor3(CameraConformance):
     @pytest.fixture
     def bench(self, andor3: FakeIoc) -> Iterator[CameraBench]:
         yield from _bench(andor3)
+
+
+class TestSimDetector(CameraConformance):
+    """Its software triggers are acquisitions of one frame."""
+
+    @pytest.fixture
+    def bench(self, simdetector: FakeIoc) -> Iterator[CameraBench]:
+        yield from _bench(simdetector)
+
+
+def _first_frame(camera: AreaDetectorCamera, ioc: FakeIoc) -> Any:
+    camera.configure(EXTERNAL)
+    camera.arm(1)
+    ioc.pulse([time.time() + 0.1])
+    return camera.next_frame(5.0)
+
+
+def test_another_size_than_configured_says_where_to_look(spinnaker: FakeIoc) -> None:
+    with closing(spinnaker.camera()) as camera:
+        spinnaker.tell("size 16 24")
+        try:
+            with pytest.raises(DeviceError, match=r"frames are 16 x 24 pixels, and 64 x 96 were set\. .*NDArrayPort"):
+                _first_frame(camera, spinnaker)
+        finally:
+            spinnaker.tell("size")
+        camera.disarm()
+        assert _first_frame(camera, spinnaker).counts.shape == (64, 96)
+
+
+def test_a_lost_frame_leaves_a_gap(spinnaker: FakeIoc) -> None:
+    """Its number is the driver's; here a frame of another size in the middle is lost."""
+    with closing(spinnaker.camera()) as camera:
+        stamps = [_first_frame(camera, spinnaker).framestamp]
+        for line, expected in (("size 16 24", DeviceError), ("size", None)):
+            spinnaker.tell(line)
+            time.sleep(0.2)
+            spinnaker.pulse([time.time() + 0.05])
+            if expected is not None:
+                with pytest.raises(expected):
+                    camera.next_frame(5.0)
+            else:
+                stamps.append(camera.next_frame(5.0).framestamp)
+        assert stamps == [0, 2]
+
+
+def test_another_sensor_than_configured_is_refused(spinnaker: FakeIoc) -> None:
+    with pytest.raises(DeviceRefused, match=r"its sensor has 256 x 320 pixels, and .*sensor is \[512, 320\]"):
+        spinnaker.camera(sensor=(512, 320))
+
+
+def test_a_label_that_its_driver_does_not_know_is_named(spinnaker: FakeIoc) -> None:
+    with closing(spinnaker.camera(driver="pco")) as camera:
+        with pytest.raises(DeviceError, match=r"TriggerMode.* = Ext Only"):
+            camera.configure(EXTERNAL)
+
+
+def test_a_wrong_prefix_is_a_timeout_that_says_what_to_check(loopback: dict[str, str]) -> None:
+    with pytest.raises(DeviceTimeout, match=r"no answer within 0\.5 s.*Check the name, that its IOC runs"):
+        AreaDetectorCamera(replace(SETTINGS, timeout=0.5), SystemClock())
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_timing_is_that_of_the_configuration(driver: str) -> None:
+    own = replace(SETTINGS, driver=driver, min_period=0.0115)  # type: ignore[arg-type]
+    timing = AreaDetectorCamera.timing_of(own, replace(EXTERNAL, binning=2))
+    assert (timing.shape, timing.min_period, timing.readout, timing.bits) == ((32, 48), 0.012, 0.003, 16)
+    assert AreaDetectorCamera.timing_of(own, replace(EXTERNAL, exposure=0.001)).min_period == 0.0115
+
+
+def _configuration(tmp_path: Path, **camera: object) -> Path:
+    """A configuration of an instrument with this camera."""
+    text = Path("configs/instrument.yaml").read_text(encoding="utf-8")
+    tree = yaml.safe_load(text)
+    tree["devices"]["camera"] = {
+        "kind": "area_detector", "prefix": "ca://2bmSP2:", "driver": "spinnaker", "line": "Line2", "roi": None,
+        "sensor": [2048, 2448], "readout_s": 0.0062, "min_period_s": 0.0065, "electrons_per_count": 0.1, **camera,
+    }  # fmt: skip
+    path = tmp_path / "my.yaml"
+    path.write_text(yaml.safe_dump(tree), encoding="utf-8")
+    return path
+
+
+def test_a_configuration_names_it_and_a_dry_run_knows_its_timing(tmp_path: Path) -> None:
+    config = load(_configuration(tmp_path))
+    timing = config.devices.camera.timing_of(CameraSettings(0.005, TriggerSource.EXTERNAL))
+    assert timing.shape == (2048, 2448) and timing.min_period == 0.0065
+
+
+def test_an_unknown_driver_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as told:
+        load(_configuration(tmp_path, driver="pcoedge"))
+    assert "devices.camera.driver" in f"{told.value}" and "spinnaker" in f"{told.value}"
+
+
+BY_CHANNEL_ACCESS = """
+import sys
+from drivers.base.clock import SystemClock
+from drivers.base.protocols import CameraSettings, TriggerSource
+from splatline_areadetector.camera import AreaDetectorCamera, AreaDetectorSettings
+own = AreaDetectorSettings("ca://spinnaker:", "spinnaker", (256, 320), 0.003, 0.5)
+camera = AreaDetectorCamera(own, SystemClock())
+camera.configure(CameraSettings(0.01, TriggerSource.SOFTWARE, (32, 64, 64, 96), 2))
+camera.arm(2)
+for _ in range(2):
+    camera.software_trigger()
+    frame = camera.next_frame(5.0)
+    print(frame.framestamp, frame.counts.shape, frame.counts.max())
+print(camera.describe()["model"])
+camera.close()
+"""
+
+
+def test_its_records_answer_by_channel_access_too(spinnaker: FakeIoc, loopback: dict[str, str]) -> None:
+    """In a process of its own: Channel Access reads its environment once."""
+    done = subprocess.run([sys.executable, "-c", BY_CHANNEL_ACCESS], capture_output=True, text=True, timeout=120)
+    assert done.stdout.splitlines() == ["0 (32, 48) 1", "1 (32, 48) 2", "fake"], done.stderr
+
+
+def test_frames_are_the_pixels_of_the_message(spinnaker: FakeIoc) -> None:
+    with closing(spinnaker.camera()) as camera:
+        np.testing.assert_array_equal(_first_frame(camera, spinnaker).counts, np.ones((64, 96), np.uint16))
