@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Callable
+from contextlib import closing, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
 import click
 
 from beamline.cli.options import say
+
+if TYPE_CHECKING:
+    from splatline_areadetector.publish_detector import PublishedDetector
+    from splatline_areadetector.publish_frames import RunFrames
+    from splatline_areadetector.publish_image import ImageServer
 
 _PREFIX = re.compile(r"[\w.\-:]{0,39}[\w.\-]:")
 _IDLE = 0.005  # s between two looks at the file
@@ -38,8 +46,7 @@ def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | 
     """Publish the frames of the newest run of the folder RUNS (default ./runs) as an EPICS areaDetector does.
 
     It only reads the run's files, so that it cannot slow a scan down. No client starts, stops or changes the scan.
-    With --files everybody who reaches the address may have frames written below that folder. Needs: pip install
-    "splatline-areadetector[publish]".
+    With --files everybody who reaches the address may have frames written below that folder.
 
     Exit code: 0 ended by Ctrl-C, 2 p4p or softioc is not installed, 5 the address or port cannot be listened at.
     """
@@ -49,34 +56,34 @@ def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | 
     from splatline_areadetector.publish_records import RecordServer
 
     name = f"{prefix}Pva1:Image"
-    image = ImageServer(name, bind, port)
-    detector = PublishedDetector(lambda record, value: server.put(record, value), files, say)
-    server = RecordServer(prefix, records(name), bind, detector.asked)
-    frames = RunFrames(runs, say)
-    click.echo(
-        f"{name} at {bind}:{image.port}, {prefix}cam1: and {prefix}HDF1: beside it. Ctrl-C ends this, not the scan."
-    )
+    with closing(ImageServer(name, bind, port)) as image:
+        detector = PublishedDetector(lambda record, value: put(record, value), files, say)
+        put = RecordServer(prefix, records(name), bind, detector.asked).put
+        with closing(detector), closing(RunFrames(runs, say)) as frames, suppress(KeyboardInterrupt):
+            click.echo(
+                f"{name} at {bind}:{image.port}, {prefix}cam1: and {prefix}HDF1: beside it. Ctrl-C ends this, not the "
+                "scan."
+            )
+            _follow(frames, image, detector, put)
+
+
+def _follow(
+    frames: RunFrames, image: ImageServer, detector: PublishedDetector, put: Callable[[str, int], None]
+) -> NoReturn:
+    """Publish frames as they come, for ever."""
     run, counted, missed = None, time.monotonic(), 0
-    try:
-        while True:
-            frame = frames.next()
-            if frames.run != run:
-                run = frames.run
-                detector.began(frames.shape, frames.dtype)
-            if frame is not None:
-                image.post(frame)
-                detector.take(frame)
-            else:
-                time.sleep(_IDLE)
-            if time.monotonic() - counted >= _CLIENTS_EVERY:
-                counted = time.monotonic()
-                now_missed = sum(each.missed for each in image.clients().values())
-                if now_missed != missed:
-                    missed = now_missed
-                    server.put("Pva1:DroppedArrays_RBV", missed)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        detector.close()
-        frames.close()
-        image.close()
+    while True:
+        frame = frames.next()
+        if frames.run != run:
+            run = frames.run
+            detector.began(frames.shape, frames.dtype)
+        if frame is not None:
+            image.post(frame)
+            detector.take(frame)
+        else:
+            time.sleep(_IDLE)
+        if time.monotonic() - counted >= _CLIENTS_EVERY:
+            counted, before = time.monotonic(), missed
+            missed = sum(client.missed for client in image.clients().values())
+            if missed != before:
+                put("Pva1:DroppedArrays_RBV", missed)

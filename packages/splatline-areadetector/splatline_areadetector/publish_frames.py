@@ -26,7 +26,7 @@ from drivers.base.frame import FrameKind
 LOOK_EVERY = 0.5  # s, for a run that began
 _SPREAD = 0.7  # of the mean time between frames: how far apart those that came together are sent
 _WINDOW = 2.0  # s over which that mean is taken
-_LONGEST = 0.25  # s that a frame waits after the one before
+_LONGEST, _AT_FIRST = 0.25, 0.02  # s that a frame waits after the one before, and while the mean is not known
 
 # Paths of docs/file_layout.md.
 _DATA, _KIND = "/entry/instrument/detector/data", "/entry/frame_log/kind"
@@ -59,17 +59,18 @@ class Pace:
     """Spreads frames that came into the file together, as the queue of a client holds four of them by default."""
 
     def __init__(self) -> None:
-        self._came, self._sent = deque[float](), -math.inf
+        self._came, self._sent = deque[tuple[float, int]](), -math.inf  # times and frames
 
     def came(self, n: int, now: float) -> None:
         """n frames came into the file by this time (s)."""
-        self._came.extend([now] * n)
-        while self._came and self._came[0] < now - _WINDOW:
+        self._came.append((now, n))
+        while self._came[0][0] < now - _WINDOW:
             self._came.popleft()
 
     def wait(self, now: float) -> float:
         """s for which the next frame is still to wait."""
-        apart = 0.0 if len(self._came) < 2 else _SPREAD * (now - self._came[0]) / len(self._came)
+        n = sum(n for _, n in self._came) - self._came[0][1] if self._came else 0
+        apart = _SPREAD * (now - self._came[0][0]) / n if n else _AT_FIRST
         return max(0.0, self._sent + min(apart, _LONGEST) - now)
 
     def sent(self, now: float) -> None:

@@ -100,7 +100,7 @@ class ImageServer:
 
     def clients(self) -> Mapping[str, ClientCount]:
         """Frames sent to and missed by each client that is connected now, since the first call that saw it."""
-        counts = {}
+        counts = dict[str, ClientCount]()
         for match in _CLIENT.finditer(self._server.tostr(5)):
             if match["pv"] != self.name or not self._frame_bytes:
                 continue

@@ -33,8 +33,8 @@ class RecordServer:
             from softioc import asyncio_dispatcher, builder, softioc
         except ImportError as error:
             raise ConfigError(
-                f"Publishing by Channel Access needs softioc, which cannot be loaded here ({error}): pip install "
-                '"splatline-areadetector[publish]". Nothing was started.'
+                f"Publishing needs softioc, which cannot be loaded here ({error}): pip install softioc. Nothing was "
+                "started."
             ) from error
         self._records: dict[str, Any] = {}
         self._setpoints = set[str]()
