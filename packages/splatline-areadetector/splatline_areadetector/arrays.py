@@ -46,7 +46,7 @@ class ArrayFrame:
     Attributes:
         unique_id: the driver's number of the frame, usually from 1 at the start of an acquisition.
         time: s since the Unix epoch, at which the driver had the frame, after readout.
-        received: s on this computer's monotonic clock.
+        received: s since the Unix epoch, on this computer's clock.
         attributes: NDAttributes by name.
         is_current: the value that the server had when it was connected: an old frame, unless its number is new.
         codec: "" for raw pixels.

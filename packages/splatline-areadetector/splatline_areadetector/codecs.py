@@ -1,8 +1,8 @@
 """Codecs: compressed pixels of areaDetector (NDPluginCodec), decoded by the filters of HDF5 that hdf5plugin brings.
 
-A frame is written as the one chunk of a dataset in memory, undecoded, and read back. areaDetector leaves out the headers
-with which the filters of HDF5 begin their chunks: of bslz4 and lz4 they are put before it (bitshuffle, Masui et al.
-2015; the LZ4 filter of the HDF Group).
+A frame is written as the one chunk of a dataset in memory, undecoded, and read back. areaDetector leaves out the
+headers with which filters of HDF5 begin their chunks: for bslz4 and lz4 they are put before the pixels (bitshuffle,
+Masui et al. 2015; the LZ4 filter of the HDF Group).
 """
 
 from __future__ import annotations

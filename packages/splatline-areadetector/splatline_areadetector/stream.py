@@ -17,7 +17,6 @@ from typing import Any, Self
 
 from beamline.core.errors import BeamlineError, ConfigError
 from drivers.base.errors import DeviceTimeout
-
 from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError, array_frame
 
 SCHEME = "pva://"
@@ -76,12 +75,11 @@ class Queues:
         return max(_LEAST, min(wanted, fits, _MOST))
 
 
-def pv_of(url: str) -> str:
-    """The name of pva://NAME. Raises ConfigError for another address."""
+def image_problem(url: str) -> str:
+    """What is wrong with the address of an image; "" if nothing is."""
     name = url.removeprefix(SCHEME)
-    if name == url or not name or any(letter.isspace() for letter in name):
-        raise ConfigError(f"{url!r} names no image; expected pva://PREFIX:Pva1:Image. Nothing was started.")
-    return name
+    good = name and name != url and not any(letter.isspace() for letter in name)
+    return "" if good else f"{url!r} names no image; expected pva://PREFIX:Pva1:Image"
 
 
 class FrameStream:
@@ -115,7 +113,9 @@ class FrameStream:
         within: float = ANSWERS_WITHIN,
         now: Callable[[], float] = time.time,
     ) -> None:
-        self.name, self._now, queues = pv_of(url), now, queues or Queues()
+        if problem := image_problem(url):
+            raise ConfigError(f"{problem}. Nothing was started.")
+        self.name, self._now, queues = url.removeprefix(SCHEME), now, queues or Queues()
         self._context = _context()
         self.still: list[tuple[float, float]] = []
         self._items: deque[Item] = deque()
@@ -124,7 +124,7 @@ class FrameStream:
         try:
             value = self._get("", within)
             _refuse_other(self.name, value)
-            self.first = array_frame(value, time.monotonic(), is_current=True)
+            self.first = array_frame(value, now(), is_current=True)
             self.queue = queues.frames(0 if self.first is None else self.first.n_bytes, period)
             self._subscription = self._context.monitor(
                 self.name, self._on_update, request=f"record[queueSize={self.queue}]", notify_disconnect=True
@@ -194,7 +194,7 @@ class FrameStream:
             raise ConfigError(f"{self.name} refuses to be read: {error}. Nothing was started.") from None
 
     def _on_update(self, value: Any) -> None:
-        received = time.monotonic()
+        received = self._now()
         try:
             if isinstance(value, Exception):
                 if not self._fresh:  # every subscription begins disconnected

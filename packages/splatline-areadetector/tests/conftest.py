@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import socket
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # for the fakes beside the tests
 
 
 def _free_ports(n: int) -> list[int]:

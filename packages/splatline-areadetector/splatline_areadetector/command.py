@@ -1,0 +1,113 @@
+"""`beamline ride`: records somebody else's scan, from its image of areaDetector, as a scan of ours."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from beamline.cli.options import json_events, json_option, set_option
+from beamline.cli.terminal import PageBeside, Terminal
+from beamline.core.errors import AlarmError
+from beamline.core.stop import StopRequest, stop_signals
+
+if TYPE_CHECKING:
+    from beamline.core.events import Sink
+    from beamline.core.run_result import RunResult
+    from splatline_areadetector.config import RideConfig
+
+
+def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+    if value:
+        from splatline_areadetector.config import EXAMPLE
+
+        click.echo(EXAMPLE, nl=False)
+        ctx.exit()
+
+
+@click.command()
+@click.argument("file", metavar="CONFIG", type=click.Path(path_type=Path))
+@click.option("--example", is_flag=True, is_eager=True, expose_value=False, callback=_print_example,
+              help="Print a configuration to edit.")  # fmt: skip
+@set_option
+@click.option("--check", "only_check", is_flag=True,
+              help="Show what the IOC says, and whether two seconds of frames arrive whole.")  # fmt: skip
+@click.option("--darks", metavar="FILE", help="Darks, where the scan takes none: a scan, HDF5 (FILE::DATASET), TIFF.")
+@click.option("--flats", metavar="FILE", help="Flats, likewise.")
+@click.option("--page", is_flag=True, help="Show the run in the browser, as `beamline watch` does.")
+@click.option("--no-live", is_flag=True, help="Run without a live reconstruction.")
+@click.option("--repeat", is_flag=True, help="After a scan, wait for the next one, until Ctrl-C.")
+@click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False),
+              help="Folder for the folders of runs. Default: storage.folder of CONFIG.")  # fmt: skip
+@json_option
+def ride(
+    file: Path,
+    overrides: tuple[str, ...],
+    only_check: bool,
+    darks: str | None,
+    flats: str | None,
+    as_json: bool,
+    **more: object,
+) -> None:
+    """Record the next scan of another program from its image of areaDetector over PVAccess, as CONFIG says.
+
+    Frames go into a run of ours, with the monitor, the page and a live volume, while tomoscan, bluesky or whatever
+    else acquires. No process variable is written, and nothing is slowed down. The first Ctrl-C ends the file in order.
+
+    Exit codes: 0 the scan is complete, 2 the configuration or the IOC's settings are wrong, 3 no server, 4 stopped, 5
+    frames are missing (which, and whose loss it was, is said), 7 alarms of the monitor.
+    """
+    from beamline.config.load import load_as
+    from splatline_areadetector.config import RideConfig
+    from splatline_areadetector.ride import load_given
+
+    config = load_as(RideConfig, file, overrides, printed_by="beamline ride --example")
+    if only_check:
+        from splatline_areadetector.looks import check
+
+        click.echo("\n".join(check(config)))
+        return
+    given = load_given(darks, flats)
+    with json_events(as_json) as json_sink:
+        results = _ride(config, given, [json_sink], **more)  # type: ignore[arg-type]
+    if not as_json:
+        click.echo("\n".join(_lines(result) for result in results))
+    if alarmed := sum(result.alarmed_frames for result in results):
+        raise AlarmError(f"The scan is complete, but {alarmed} frames have an alarm of the monitor.")
+
+
+def _ride(
+    config: RideConfig,
+    given: object,
+    others: list[Sink],
+    *,
+    page: bool,
+    no_live: bool,
+    repeat: bool,
+    output: Path | None,
+) -> list[RunResult]:
+    from splatline_areadetector.ride import Ride, opened, ride_scan
+
+    stop, results = StopRequest(), []
+    with ExitStack() as held:
+        held.enter_context(stop_signals(stop))
+        terminal = held.enter_context(Terminal(sys.stderr))
+        sinks: list[Sink] = [terminal, *others]
+        if page:
+            sinks.append(held.enter_context(PageBeside(terminal.say)))
+        stream, guide, counters = opened(config, held)
+        runs = output or Path(config.storage.folder)
+        now = Ride(config, stream, guide, counters, given, runs, stop, terminal.say)  # type: ignore[arg-type]
+        while True:
+            results += ride_scan(now, sinks, live=not no_live)
+            if not repeat or stop.stopping:
+                return results
+
+
+def _lines(result: RunResult) -> str:
+    return f"{'file':<10}{result.path}\n{'frames':<10}{result.n_frames}" + (
+        f"\n{'volume':<10}{result.recon.get('output')}" if result.recon else ""
+    )

@@ -1,0 +1,148 @@
+"""RidePlan: what is known of the scan of another program when its first frame comes, as a plan that can be recorded."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.config.load import resolved_yaml
+from beamline.core.events import json_of
+from beamline.core.text import size
+from beamline.monitor.digest import preview_shape
+from beamline.plan.plan import Block, FieldPlan, Mode, Place, ScanPlan, Timeline
+from beamline.scan.preflight import ReadyScan, ready_scan
+from beamline.storage.writers.nxtomo import ScanInfo
+from drivers.base.frame import FrameKind
+from drivers.base.protocols import CameraSettings, CameraTiming, TriggerSource
+from splatline_areadetector.arrays import ArrayFrame
+from splatline_areadetector.config import RideConfig
+
+REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
+_USUAL_PERIOD = 0.1  # s, of frames whose period nobody tells: for the time left alone
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedBlock:
+    """Frames of a kind that follow one another."""
+
+    kind: FrameKind
+    n: int
+
+
+@dataclass(frozen=True, eq=False)
+class RidePlan:
+    """The scan as its program plans it.
+
+    Attributes:
+        blocks: in the order of acquisition.
+        angles: float64 [view] radians; NaN where only the frames tell.
+        exposures: s by kind; of views where a kind has none.
+        period: s between frames; None: not known.
+        told_by: what says so, for the record.
+    """
+
+    blocks: tuple[PlannedBlock, ...]
+    angles: NDArray[np.float64]
+    exposures: Mapping[FrameKind, float]
+    period: float | None
+    told_by: str
+
+    def exposure(self, kind: FrameKind) -> float:
+        """s; NaN: not known."""
+        return self.exposures.get(kind, self.exposures.get(FrameKind.PROJECTION, math.nan))
+
+    @property
+    def first_triggers(self) -> list[int]:
+        """Of each block, within the whole plan."""
+        return [0, *accumulate(block.n for block in self.blocks[:-1])]
+
+
+def timeline_of(plan: RidePlan, shape: tuple[int, int], preview_bin: int, free: int) -> Timeline:
+    """The plan in the terms of a scan of ours; nothing moves, so that it breaks no limit."""
+    period = plan.period or _USUAL_PERIOD
+    blocks = tuple(
+        Block(
+            each.kind,
+            Mode.STATIC if each.kind in REFERENCES else Mode.STEP,
+            first,
+            np.full(each.n, np.nan) if each.kind in REFERENCES else plan.angles,
+            plan.exposure(each.kind),
+            period,
+        )
+        for each, first in zip(plan.blocks, plan.first_triggers, strict=True)
+    )
+    n_frames = sum(block.n for block in blocks)
+    frame_bytes = 2 * math.prod(shape)
+    total = n_frames * (frame_bytes + 4 * math.prod(preview_shape(shape, preview_bin)))
+    remarks = ["the scan is another program's: it is neither paused nor repeated, and no device is operated"]
+    if total > free:
+        remarks.append(f"the scan needs {size(total)}, the disk has {size(free)} free: free some while it runs")
+    return Timeline(blocks, n_frames * period, frame_bytes, total, 0, 0.0, 0.0, 0.0, (), tuple(remarks), _plan_of(plan))
+
+
+def _plan_of(plan: RidePlan) -> ScanPlan:
+    def field(kind: FrameKind) -> FieldPlan:
+        n = [block.n for block in plan.blocks if block.kind is kind]
+        before = plan.blocks and plan.blocks[0].kind in REFERENCES
+        place = Place.NONE if not n else Place.BOTH if len(n) > 1 else Place.START if before else Place.END
+        return FieldPlan(max(n, default=0), place, plan.exposure(kind))
+
+    return ScanPlan(
+        plan.angles, Mode.STEP, plan.exposure(FrameKind.PROJECTION), plan.period or 0.0, 0.0,
+        field(FrameKind.DARK), field(FrameKind.FLAT), plan.told_by,
+    )  # fmt: skip
+
+
+def ready_of(config: RideConfig, plan: RidePlan, first: ArrayFrame, runs: Path) -> ReadyScan:
+    """The ridden scan ready to be recorded, by its plan and its first frame.
+
+    Raises:
+        ConfigError: the optics and the frame contradict each other.
+    """
+    shape, binning = first.window.shape, first.window.binning
+    bits = config.ride.bits or 8 * first.dtype.itemsize
+    timing = CameraTiming(shape, plan.period or 0.0, 0.0, 0.0, bits)
+    settings = CameraSettings(plan.exposure(FrameKind.PROJECTION), TriggerSource.EXTERNAL, None, binning[0])
+    timeline = timeline_of(plan, shape, config.storage.preview_bin, _free(runs))
+    optics, known = config.optics, not np.isnan(plan.angles).any()
+    asked = {
+        "scheme": plan.told_by,
+        "exposure_s": plan.exposure(FrameKind.PROJECTION),
+        **({"angles_deg": np.degrees(plan.angles).tolist()} if known else {}),
+    }
+    info = ScanInfo(
+        sample=config.sample.name,
+        title=config.sample.description,
+        diameter_mm=config.sample.diameter_mm,
+        pixel_size_mm=1e-3 * optics.pixel_size_um * binning[1],
+        energy_kev=optics.energy_kev,
+        distance_mm=optics.distance_mm,
+        exposure=plan.exposure(FrameKind.PROJECTION),
+        period=plan.period,
+        axis_col=optics.axis_col,
+        plan=json_of(asked),
+        config=resolved_yaml(config),
+        devices={"areadetector": _described(config, first)},
+        saturation=float(2**bits - 1),
+    )
+    return ready_scan(config, timeline, settings, timing, info)
+
+
+def _described(config: RideConfig, first: ArrayFrame) -> dict[str, str | int | float]:
+    window = first.window
+    return {
+        "image": config.ride.image, "rows": window.shape[0], "cols": window.shape[1], "row0": window.offset[0],
+        "col0": window.offset[1], "binning": window.binning[0], "type": str(first.dtype), "codec": first.codec,
+    }  # fmt: skip
+
+
+def _free(runs: Path) -> int:
+    there = next(place for place in (runs.absolute(), *runs.absolute().parents) if place.exists())
+    return shutil.disk_usage(there).free

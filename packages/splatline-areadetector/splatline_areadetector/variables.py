@@ -1,0 +1,228 @@
+"""Variables: process variables of an IOC, subscribed to over PVAccess or Channel Access, each with its history.
+
+Nothing is written. Values and frames come by different ways, and a computer that stood still takes all of them at once:
+so a value counts from the time that its IOC gave it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, Self
+
+from beamline.core.errors import ConfigError
+from drivers.base.errors import DeviceTimeout
+
+Value = float | str
+_ANSWER, _OTHERS = 3.0, 1.5  # s, for variables that are needed, and for others
+_LONGEST_DELAY = 60.0  # s: an IOC whose clock is off by more has none that is set
+
+
+def url_problem(url: str) -> str:
+    """What is wrong with the address of process variables; "" if nothing is."""
+    scheme, _, name = url.partition("://")
+    good = scheme in ("pva", "ca") and name and not any(letter.isspace() for letter in name)
+    return "" if good else f"{url!r} names no process variables; expected pva://PREFIX or ca://PREFIX"
+
+
+class History:
+    """The values of a variable by the time at which its IOC set them, s since the Unix epoch.
+
+    Args:
+        now: of this computer.
+
+    Attributes:
+        delay: the least time from a change to its arrival, with the difference of the clocks; None: none was seen.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.time) -> None:
+        self._now, self._stamps, self._values = now, list[float](), list[Value]()
+        self.delay: float | None = None
+
+    def add(self, stamp: float, value: Value) -> None:
+        """The next value, with the IOC's time. The first is that of the subscription, which may be old."""
+        received = self._now()
+        if self._values:
+            if not abs(received - stamp) < _LONGEST_DELAY:  # its clock was never set
+                stamp = received
+            delay = received - stamp
+            self.delay = delay if self.delay is None else min(self.delay, delay)
+            stamp = max(stamp, self._stamps[-1])
+        self._stamps.append(stamp)
+        self._values.append(value)
+
+    @property
+    def last(self) -> Value | None:
+        """The present value; None: there is none yet."""
+        return self._values[-1] if self._values else None
+
+    @property
+    def changed_at(self) -> float:
+        """The IOC's time of the present value."""
+        return self._stamps[-1] if self._stamps else 0.0
+
+    def rise(self, begin: float, end: float) -> float | None:
+        """By how much a counter rose between two times of its IOC; None: it is not known."""
+        try:
+            before, after = (float(self.until(seconds)[-1]) for seconds in (begin, end))
+        except (IndexError, ValueError):
+            return None
+        return max(0.0, after - before)
+
+    def until(self, seconds: float) -> Sequence[Value]:
+        """The values that the IOC had set by then, oldest first; always the first one, which was there before us."""
+        return self._values[: max(1, bisect_right(self._stamps, seconds))]
+
+
+class Variables:
+    """Subscribed variables below a prefix, until `close`.
+
+    Args:
+        url: pva://PREFIX or ca://PREFIX.
+        names: what follows the prefix.
+        needed: those that must answer within 3 s.
+
+    Raises:
+        DeviceTimeout: one that is needed does not answer.
+        ConfigError: the library is not installed.
+    """
+
+    def __init__(
+        self, url: str, names: Sequence[str], needed: Sequence[str] = (), now: Callable[[], float] = time.time
+    ) -> None:
+        scheme, _, self.prefix = url.partition("://")
+        self.histories = {name: History(now) for name in names}
+        self._came = threading.Condition()
+        subscribe = _over_pva if scheme == "pva" else _over_ca
+        try:
+            self._close = subscribe({self.prefix + name: self._adder(name) for name in names})
+        except ImportError as error:
+            raise ConfigError(
+                f'{url} needs the library {error.name}: pip install "splatline[areadetector]". Nothing was started.'
+            ) from error
+        with self._came:
+            self._came.wait_for(lambda: not self._silent(needed), _ANSWER)
+            self._came.wait_for(lambda: not self._silent(names), _OTHERS)
+        if silent := self._silent(needed):
+            self.close()
+            raise DeviceTimeout(
+                url,
+                f"no answer within {_ANSWER:g} s",
+                request=", ".join(self.prefix + name for name in silent),
+                advice="Check the prefix, that its IOC runs, and which hosts are asked (EPICS_CA_ADDR_LIST, "
+                "EPICS_PVA_ADDR_LIST)",
+                state="Nothing was started",
+            )
+
+    def _silent(self, names: Sequence[str]) -> list[str]:
+        return [name for name in names if self.histories[name].last is None]
+
+    def _adder(self, name: str) -> Callable[[float, Value], None]:
+        def add(stamp: float, value: Value) -> None:
+            with self._came:
+                self.histories[name].add(stamp, value)
+                self._came.notify()
+
+        return add
+
+    def number(self, name: str) -> float | None:
+        """The present value as a number; None: not known."""
+        with suppress(TypeError, ValueError):
+            return float(self.histories[name].last)  # type: ignore[arg-type]
+        return None
+
+    def text(self, name: str) -> str:
+        """The present value as text; "": not known."""
+        last = self.histories[name].last
+        return "" if last is None else str(last)
+
+    def close(self) -> None:
+        self._close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+Add = Callable[[float, Value], None]
+
+
+def _plain(value: Any) -> Value:
+    """A number, or text: of a label, a string, or an array of characters."""
+    if hasattr(value, "dtype") and value.ndim:
+        return bytes(value.astype("u1")).split(b"\0")[0].decode(errors="replace")
+    return str(value) if isinstance(value, str) else float(value)
+
+
+def _over_pva(adders: dict[str, Add]) -> Callable[[], None]:
+    from p4p.client.thread import Context
+
+    context = Context("pva", nt=False)
+
+    def taking(add: Add) -> Callable[[Any], None]:
+        def take(update: Any) -> None:
+            if isinstance(update, Exception):
+                return
+            value, stamp = update.value, update.get("timeStamp")
+            choices = getattr(value, "choices", None)
+            seconds = 0.0 if stamp is None else stamp.secondsPastEpoch + 1e-9 * stamp.nanoseconds
+            add(seconds, choices[value.index] if choices else _plain(value))
+
+        return take
+
+    subscriptions = [context.monitor(name, taking(add)) for name, add in adders.items()]
+
+    def close() -> None:
+        for each in subscriptions:
+            each.close()
+        context.close()
+
+    return close
+
+
+_LOOP: list[asyncio.AbstractEventLoop] = []
+"""The event loop of Channel Access, in a thread of its own, once a process."""
+
+
+def _loop() -> asyncio.AbstractEventLoop:
+    if not _LOOP:
+        _LOOP.append(asyncio.new_event_loop())
+        threading.Thread(target=_LOOP[0].run_forever, name="channel access", daemon=True).start()
+    return _LOOP[0]
+
+
+def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
+    import aioca
+
+    def taking(name: str, add: Add) -> Callable[[Any], Any]:
+        labels: list[str] = []
+
+        async def take(update: Any) -> None:
+            if not update.ok:
+                return
+            if update.datatype == aioca.DBR_ENUM and not labels:  # which updates with a time leave out
+                labels.extend((await aioca.caget(name, format=aioca.FORMAT_CTRL)).enums)
+            is_label = update.datatype == aioca.DBR_ENUM and int(update) < len(labels)
+            add(float(update.timestamp), labels[int(update)] if is_label else _plain(update))
+
+        return take
+
+    async def start() -> list[Any]:
+        return [
+            aioca.camonitor(name, taking(name, add), format=aioca.FORMAT_TIME, all_updates=True)
+            for name, add in adders.items()
+        ]
+
+    subscriptions = asyncio.run_coroutine_threadsafe(start(), _loop()).result()
+
+    def close() -> None:
+        for each in subscriptions:
+            _loop().call_soon_threadsafe(each.close)
+
+    return close
