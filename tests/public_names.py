@@ -28,7 +28,7 @@ FOR_BLUESKY = {
 
 # What other packages add and prove devices, formats and methods with.
 FOR_PACKAGES = {
-    "beamline.cli.options": ("as_scan", "json_option", "parsed", "volume_argument", "volume_path"),
+    "beamline.cli.options": ("as_scan", "json_option", "parsed", "say", "volume_argument", "volume_path"),
     "beamline.cli.terminal": ("Answer", "answering"),
     "beamline.core.errors": ("BeamlineError", "ConfigError", "DataError", "QualityError", "user_message"),
     "beamline.core.files": ("refuse_existing", "text_in", "atomic_file", "write_together", "write_whole"),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,7 +16,6 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from drivers.epics.channel import ProcessVariable, open_channel
 from recon.base.setting import setting
-
 from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError
 from splatline_areadetector.camera_labels import DRIVERS, DriverLabels
 from splatline_areadetector.stream import Disconnected, FrameStream, Item, Overflow, Queues, Refused
@@ -40,7 +40,9 @@ class AreaDetectorSettings:
     image: str | None = setting(None, "pva://NAME of the frames; null: PREFIXPva1:Image.")
     line: str = setting("Line0", "The camera's input for trigger pulses (spinnaker).")
     min_period: float = setting(0.0, "Between triggers, at least.", unit="s", ge=0, le=100)
-    dead: float = setting(0.0, "Between exposures; readout_s where it does not expose meanwhile.", unit="s", ge=0, le=100)
+    dead: float = setting(
+        0.0, "Between exposures; readout_s where it does not expose meanwhile.", unit="s", ge=0, le=100
+    )
     row_period: float = setting(0.0, "From row to row of a rolling shutter; 0: global.", unit="s", ge=0, le=1)
     bits: int = setting(16, "Of a count.", ge=8, le=16)
     offset: float = setting(0.0, "Counts without light.", ge=0, le=65535)
@@ -74,8 +76,8 @@ class _Records:
             if self._clock.now() > deadline:
                 raise DeviceRefused(
                     self._name, f"{record} did not take {value!r}", request=f"{self._prefix}{record} = {value}",
-                    reply=f"{record}_RBV is {shown!r}", advice="Set it in the camera's control screen to see why not, and "
-                    "check `driver`", state="Other settings may have changed",
+                    reply=f"{record}_RBV is {shown!r}", advice="Try it in the camera's control screen, and check `driver`",
+                    state="Other settings may have changed",
                 )  # fmt: skip
             self._clock.sleep(_LOOK_EVERY)
         return shown
@@ -92,12 +94,14 @@ class _Records:
 
 def _is_near(shown: float | str, value: float | str, within: float) -> bool:
     if isinstance(shown, str) or isinstance(value, str):
-        # A switch is written as 0 or 1, and shows its label.
         return shown == value or (isinstance(shown, str) and shown in _SWITCHED.get(value, ()))
     return abs(shown - value) <= within * abs(value) + 1e-9
 
 
-_SWITCHED: dict[float | str, tuple[str, ...]] = {0: ("No", "Disable", "Off", "Done"), 1: ("Yes", "Enable", "On", "Acquire", "Acquiring")}  # fmt: skip
+_SWITCHED: dict[float | str, tuple[str, ...]] = {
+    0: ("No", "Disable", "Off", "Done"), 1: ("Yes", "Enable", "On", "Acquire", "Acquiring"),
+}  # fmt: skip
+"""Labels of switches, which are written as 0 or 1."""
 
 
 class AreaDetectorCamera:
@@ -175,8 +179,9 @@ class AreaDetectorCamera:
             raise DeviceRefused(self.name, str(error), state="Its settings are as they were") from error
         try:
             self._settings = self._applied(settings)
-        except DeviceRefused:
-            self._settings = self._applied(self._settings)
+        except DeviceError:
+            with suppress(DeviceError):
+                self._applied(self._settings)
             raise
         return self._settings
 
@@ -305,7 +310,8 @@ class AreaDetectorCamera:
         rows, cols = (int(self._records.read(f"cam1:MaxSize{axis}_RBV")) for axis in "YX")
         if (rows, cols) != tuple(self._own.sensor):
             raise DeviceRefused(
-                self.name, f"its sensor has {rows} x {cols} pixels, and devices.camera.sensor is {list(self._own.sensor)}",
+                self.name,
+                f"its sensor has {rows} x {cols} pixels, and devices.camera.sensor is {list(self._own.sensor)}",
                 advice="Correct `sensor`, or `prefix` if it is another camera", state="Nothing was set",
             )  # fmt: skip
 
@@ -387,5 +393,3 @@ class AreaDetectorCamera:
             self._lost += 1
             self._overrun += 1
         self._ring.append(frame)
-
-

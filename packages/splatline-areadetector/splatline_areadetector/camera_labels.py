@@ -1,4 +1,4 @@
-"""What drivers of areaDetector are told for each source of triggers: records of `cam1:` and their labels, in this order.
+"""What drivers of areaDetector are told for each source of triggers: records of `cam1:` and labels, in this order.
 
 Labels, never indices: a driver's choices change with its camera. Sources: the templates of ADSpinnaker and ADGenICam,
 ADSimDetector, ADPcoWin, ADAndor3, ADHamamatsuDCAM and ADEiger, and what tomoscan (APS) writes.
@@ -50,7 +50,7 @@ def _by_mode(internal: str, external: str, software: str) -> Mapping[TriggerSour
 
 
 def _by_genicam() -> Mapping[TriggerSource, Writes]:
-    waits = {"TriggerMode": "On", "TriggerOverlap": "ReadOut", "ExposureMode": "Timed", "FrameRateEnable": 0}
+    waits: Writes = {"TriggerMode": "On", "TriggerOverlap": "ReadOut", "ExposureMode": "Timed", "FrameRateEnable": 0}
     return {
         TriggerSource.INTERNAL: {"TriggerMode": "Off"},
         TriggerSource.EXTERNAL: {"TriggerSource": "{line}", **waits},
@@ -59,7 +59,11 @@ def _by_genicam() -> Mapping[TriggerSource, Writes]:
 
 
 def _by_hamamatsu() -> Mapping[TriggerSource, Writes]:
-    sources = {TriggerSource.INTERNAL: "Internal", TriggerSource.EXTERNAL: "External", TriggerSource.SOFTWARE: "Software"}
+    sources = {
+        TriggerSource.INTERNAL: "Internal",
+        TriggerSource.EXTERNAL: "External",
+        TriggerSource.SOFTWARE: "Software",
+    }
     return {
         source: {"HamaTriggerSource": label, "HamaTriggerMode": "Normal", "HamaTriggerActive": "Edge"}
         for source, label in sources.items()

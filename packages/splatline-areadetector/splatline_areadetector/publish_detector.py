@@ -1,7 +1,7 @@
 """PublishedDetector: what clients see of the scan's camera (cam1:) and ask of the file plugin (HDF1:).
 
-Neither starts, stops or changes anything of the scan. `Acquire` counts the frames of the scan that come from now on, and
-`Capture` has those written into a file of the client's.
+Neither starts, stops or changes anything of the scan. `Acquire` counts the frames of the scan that come from now on,
+and `Capture` has those written into a file of the client's.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from beamline.core.errors import BeamlineError, DataError, user_message
-
 from splatline_areadetector.publish_file import XML, FrameFile
 from splatline_areadetector.publish_frames import PublishedFrame
 

@@ -10,7 +10,6 @@ import h5py
 import numpy as np
 
 from beamline.core.errors import DataError
-
 from splatline_areadetector.publish_frames import PublishedFrame
 from splatline_areadetector.publish_image import attributes_of
 
@@ -82,7 +81,8 @@ class FrameFile:
         seconds = int(frame.time)
         values = {
             **attributes_of(frame), "NDArrayUniqueId": frame.unique_id, "NDArrayTimeStamp": frame.time,
-            "NDArrayEpicsTSSec": max(0, seconds - _EPICS_EPOCH), "NDArrayEpicsTSnSec": int(1e9 * (frame.time - seconds)),
+            "NDArrayEpicsTSSec": max(0, seconds - _EPICS_EPOCH),
+            "NDArrayEpicsTSnSec": int(1e9 * (frame.time - seconds)),
         }  # fmt: skip
         try:
             for column, value in ((self._data, frame.counts), *((c, values[n]) for n, c in self._columns.items())):

@@ -98,7 +98,8 @@ class RunFrames:
         self.run: Path | None = None
         self.shape, self.dtype = (0, 0), np.dtype(np.uint16)
         self._file: Any = None
-        self._columns, self._counter = list[Any](), None  # stay open: HDF5 refreshes wrongly what is open twice
+        self._columns: list[Any] = []  # stay open: HDF5 refreshes wrongly what is open twice
+        self._counter: Any = None
         self._pace, self._looked = Pace(), -math.inf
         self._next = self._committed = 0
         self._look()

@@ -1,4 +1,4 @@
-"""ImageServer: frames as areaDetector's plugin NDPluginPva publishes them (NTNDArray), and what each client has missed."""
+"""ImageServer: frames as areaDetector's NDPluginPva publishes them (NTNDArray), and how many each client missed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 
 from beamline.core.errors import ConfigError, DataError
 from drivers.base.frame import FrameKind
-
 from splatline_areadetector.publish_frames import PublishedFrame
 
 LOCATIONS = {

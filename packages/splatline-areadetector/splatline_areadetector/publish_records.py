@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 from beamline.core.errors import ConfigError
-
 from splatline_areadetector.publish_detector import BUSY, Record, Sides, Value
 
 
@@ -63,8 +62,8 @@ class RecordServer:
         if record.length:
             facts["length"] = record.length
         if handler is not None:
-            # A put that waits is answered when the readback shows it. Not so where it would wait for frames: softioc has
-            # no record of the type busy, and a stop would queue behind it.
+            # A put that waits is answered when the readback shows it. Not so where it would wait for frames: softioc
+            # has no record of the type busy, and a stop would queue behind it.
             facts |= {"on_update": handler, "always_update": True, "blocking": record.name not in BUSY}
         make = getattr(builder, f"{kind}{'In' if handler is None else 'Out'}")
         self._records[name] = make(name, *arguments, **facts)

@@ -1,7 +1,7 @@
 """A fake camera behind areaDetector, as a program: records by Channel Access and PVAccess, its image by PVAccess.
 
-fake_camera.py PREFIX DRIVER. Lines of stdin are times (s since 1970) of pulses on its trigger input, or "size ROWS COLS",
-which makes its next frames that large, as a plugin before the image does.
+fake_camera.py PREFIX DRIVER. Lines of stdin are times (s since 1970) of pulses on its trigger input, or "size ROWS
+COLS", which makes its next frames that large, as a plugin before the image does.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SOURCES = ("Software", "Line0", "Line1", "Line2")
 def records(driver: str) -> list[Record]:
     rows, cols = SENSOR
     return [
-        *(Record(f"cam1:{name}", text, sides=Sides.READBACK) for name, text in (("Model", "fake"), ("Manufacturer", "x"))),
+        *(Record(f"cam1:{name}", "fake", sides=Sides.READBACK) for name in ("Model", "Manufacturer")),
         *(Record(f"cam1:{name}", n, sides=Sides.READBACK) for name, n in (("MaxSizeX", cols), ("MaxSizeY", rows))),
         Record("cam1:Acquire", 0, ("Done", "Acquire")),
         Record("cam1:AcquireTime", 0.01),

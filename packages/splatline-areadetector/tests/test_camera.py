@@ -148,9 +148,8 @@ def test_another_sensor_than_configured_is_refused(spinnaker: FakeIoc) -> None:
 
 
 def test_a_label_that_its_driver_does_not_know_is_named(spinnaker: FakeIoc) -> None:
-    with closing(spinnaker.camera(driver="pco")) as camera:
-        with pytest.raises(DeviceError, match=r"TriggerMode.* = Ext Only"):
-            camera.configure(EXTERNAL)
+    with closing(spinnaker.camera(driver="pco")) as camera, pytest.raises(DeviceError, match="TriggerMode = Ext Only"):
+        camera.configure(EXTERNAL)
 
 
 def test_a_wrong_prefix_is_a_timeout_that_says_what_to_check(loopback: dict[str, str]) -> None:

@@ -1,4 +1,4 @@
-"""Frames of a run, each once and in order, as areaDetector's clients see them; what clients ask, and what is refused."""
+"""Frames of a run, each once and in order, as clients of areaDetector see them; what they ask, and what is refused."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from contextlib import ExitStack, contextmanager
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import h5py
@@ -58,9 +58,7 @@ def test_our_scan_ridden_by_ours_is_equal_to_the_bit(loopback: dict[str, str], t
     with ExitStack() as stack:
         server = stack.enter_context(_beamline("publish", tmp_path / "runs", "--prefix", "T:SPL:"))
         _until_line(server, "Ctrl-C ends this")
-        rider = stack.enter_context(
-            _beamline("ride", tmp_path / "my.yaml", "--no-live", "-o", tmp_path / "rides")
-        )
+        rider = stack.enter_context(_beamline("ride", tmp_path / "my.yaml", "--no-live", "-o", tmp_path / "rides"))
         said = _until_line(rider, "aits")
         own = stack.enter_context(_beamline(*scan))
         assert own.communicate(timeout=300)[0] is not None and own.returncode == 0
@@ -68,7 +66,12 @@ def test_our_scan_ridden_by_ours_is_equal_to_the_bit(loopback: dict[str, str], t
         assert rider.returncode == 0, said
     (ours,), (theirs,) = ((tmp_path / name).glob("*/scan.h5") for name in ("runs", "rides"))
     with h5py.File(ours) as one, h5py.File(theirs) as other:
-        for path in ("instrument/detector/data", "frame_log/kind", "frame_log/trigger", "instrument/detector/count_time"):
+        for path in (
+            "instrument/detector/data",
+            "frame_log/kind",
+            "frame_log/trigger",
+            "instrument/detector/count_time",
+        ):
             np.testing.assert_array_equal(other[f"entry/{path}"][:], one[f"entry/{path}"][:], err_msg=path)
         assert len(one["entry/frame_log/kind"]) == VIEWS + 12
         views = one["entry/frame_log/kind"][:] == 0
