@@ -76,8 +76,8 @@ class _Records:
             if self._clock.now() > deadline:
                 raise DeviceRefused(
                     self._name, f"{record} did not take {value!r}", request=f"{self._prefix}{record} = {value}",
-                    reply=f"{record}_RBV is {shown!r}", advice="Try it in the camera's control screen, and check `driver`",
-                    state="Other settings may have changed",
+                    reply=f"{record}_RBV is {shown!r}", state="Other settings may have changed",
+                    advice="Try it in the camera's control screen, and check `driver`",
                 )  # fmt: skip
             self._clock.sleep(_LOOK_EVERY)
         return shown

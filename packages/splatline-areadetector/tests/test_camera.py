@@ -195,7 +195,7 @@ import sys
 from drivers.base.clock import SystemClock
 from drivers.base.protocols import CameraSettings, TriggerSource
 from splatline_areadetector.camera import AreaDetectorCamera, AreaDetectorSettings
-own = AreaDetectorSettings("ca://spinnaker:", "spinnaker", (256, 320), 0.003, 0.5)
+own = AreaDetectorSettings("ca://spinnaker:", "spinnaker", (256, 320), 0.003, 0.5, timeout=30.0)
 camera = AreaDetectorCamera(own, SystemClock())
 camera.configure(CameraSettings(0.01, TriggerSource.SOFTWARE, (32, 64, 64, 96), 2))
 camera.arm(2)
