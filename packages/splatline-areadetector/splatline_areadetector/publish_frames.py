@@ -10,7 +10,7 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -150,8 +150,11 @@ class RunFrames:
             if run == self.run:
                 return
             file = open_hdf5(run / "scan.h5", follow=True)
-            with readable(run):
-                columns, counter = [file[path] for path in _COLUMNS], file[_COMMITTED]
+            with ExitStack() as failed:
+                failed.callback(file.close)
+                with readable(run):
+                    columns, counter = [file[path] for path in _COLUMNS], file[_COMMITTED]
+                failed.pop_all()
             self.close()
             self._file, self.run, self._columns, self._counter = file, run, columns, counter
             self.shape, self.dtype = columns[0].shape[1:], columns[0].dtype

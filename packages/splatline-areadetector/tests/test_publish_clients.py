@@ -114,7 +114,7 @@ def ridden(loopback: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -
             if value.value is not None:
                 ridden.by_p4p.append((value.uniqueId, zlib.crc32(value.value.tobytes())))
 
-        client.monitor("T:DET:Pva1:Image", see, request="record[queueSize=100]")
+        stack.enter_context(closing(client.monitor("T:DET:Pva1:Image", see, request="record[queueSize=100]")))
         for viewer in viewers:
             _line(viewer, "ready")
         threading.Thread(target=_read, args=(viewers[0], ridden.by_viewer), daemon=True).start()
@@ -195,8 +195,9 @@ def test_a_client_that_stands_still_loses_its_own_frames_and_holds_nobody_up(
 
     n, frame, come, slowest = 60, np.zeros((2048, 2048), np.uint16), list[int](), 0.0
     with closing(ImageServer("T:Pva1:Image", "127.0.0.1", 0)) as image, Context("pva", nt=False) as client:
-        client.monitor("T:Pva1:Image", lambda value: come.append(value.uniqueId), request="record[queueSize=100]")
-        with _program(HERE / "viewer.py", "T:Pva1:Image", log=tmp_path / "viewer.log") as still:
+        watched = client.monitor("T:Pva1:Image", lambda value: come.append(value.uniqueId), "record[queueSize=100]")
+        still_one = _program(HERE / "viewer.py", "T:Pva1:Image", log=tmp_path / "viewer.log")
+        with closing(watched), still_one as still:
             _line(still, "ready")
             _until(lambda: len(image_clients(image)) == 2)
             still.send_signal(signal.SIGSTOP)
