@@ -28,19 +28,44 @@ FOR_BLUESKY = {
 
 # What other packages add and prove devices, formats and methods with.
 FOR_PACKAGES = {
-    "beamline.cli.options": ("as_scan", "json_option", "parsed", "say", "volume_argument", "volume_path"),
-    "beamline.cli.terminal": ("Answer", "answering"),
-    "beamline.core.errors": ("BeamlineError", "ConfigError", "DataError", "QualityError", "user_message"),
+    "beamline.cli.options": (
+        "as_scan", "json_events", "json_option", "parsed", "say", "set_option", "volume_argument", "volume_path",
+    ),
+    "beamline.cli.terminal": ("Answer", "PageBeside", "Terminal", "answering"),
+    "beamline.core.errors": (
+        "AlarmError", "BeamlineError", "ConfigError", "DataError", "InstrumentError", "QualityError", "user_message",
+    ),
     "beamline.core.files": ("refuse_existing", "text_in", "atomic_file", "write_together", "write_whole"),
-    "beamline.core.text": ("csv_text", "safe_name", "size"),
+    "beamline.core.text": ("count", "csv_text", "safe_name", "size", "spans"),
     "beamline.core.quantities": ("VoxelKind",),
+    "beamline.core.events": ("BlockDone", "BlockStarted", "Sink", "StateEntered", "Warned", "json_of"),
+    "beamline.core.machine": ("free_memory",),
+    "beamline.core.run_result": ("RunResult",),
+    "beamline.core.stop": ("ScanAborted", "ScanStopped", "StopRequest", "stop_signals"),
+    "beamline.config.beam": ("NoBeamMonitor",),
+    "beamline.config.load": ("load_as", "resolved_yaml"),
+    "beamline.config.models": (
+        "Degrees", "Fields", "OpticsSection", "ReconSection", "SampleSection", "Seconds", "StorageSection", "Views",
+        "WishSection",
+    ),
+    "beamline.config.monitor": ("MonitorSection", "ReferencesSection"),
+    "beamline.config.section": ("Section", "section_of"),
+    "beamline.instrument.connect": ("ConnectedDevices",),
     "beamline.gaussians": ("Model", "read_model"),
+    "beamline.monitor.digest": ("preview_shape",),
     "beamline.page.followed_run": ("PERIOD", "FollowedRun", "RunValues", "Severity", "StampedValues", "choice_of"),
     "beamline.plan.passes": ("Choice",),
+    "beamline.plan.plan": ("Block", "FieldPlan", "Mode", "Place", "ScanPlan", "Timeline"),
     "beamline.report.figures": ("WIDTH", "finish", "new_figure", "png"),
     "beamline.scan.energies": ("scans_of",),
     "beamline.scenes.scene_file": ("open_scene",),
     "beamline.scan.control": ("State", "Verb", "ask"),
+    "beamline.scan.ledger": ("LedgerError",),
+    "beamline.scan.live_plan": ("live_plan",),
+    "beamline.scan.live_process": ("LiveCommand", "follow_command"),
+    "beamline.scan.measurement": ("FrameSource", "Measurement"),
+    "beamline.scan.preflight": ("ReadyScan", "ready_scan"),
+    "beamline.scan.run": ("record_scan",),
     "beamline.scan.runs": ("newest",),
     "recon.base.method": ("Method", "ReconProblem"),
     "recon.base.method_kinds": ("Direct", "Iterative", "Series"),
@@ -57,16 +82,18 @@ FOR_PACKAGES = {
     "beamline.storage.frame_table": ("FrameTable",),
     "beamline.storage.readers.base": ("WHOLE", "ScanFormat", "ScanSource", "frame_indices"),
     "beamline.storage.readers.open": ("open_scan",),
+    "beamline.storage.readers.reference_files": ("load_images",),
+    "beamline.storage.writers.nxtomo": ("ScanInfo",),
     "beamline.storage.volumes.files": ("opened_volume", "write_volume"),
     "beamline.storage.volumes.base": ("Slices", "VolumeFormat", "bare_record"),
     "beamline.monitor.check": ("Check", "CheckResult", "Flag", "Level", "Policy", "ScanContext"),
     "beamline.testing": ("ReaderConformance",),
-    "drivers.base.clock": ("Clock",),
+    "drivers.base.clock": ("Clock", "SystemClock"),
     "drivers.base.errors": ("DeviceError", "DeviceRefused", "DeviceTimeout"),
     "drivers.base.frame": ("Frame", "FrameKind"),
     "drivers.base.protocols": (
-        "Camera", "CameraFrame", "CameraSettings", "CameraTiming", "RotationStage", "StageLimits", "TriggerSource",
-        "TriggerTrain",
+        "Camera", "CameraFrame", "CameraSettings", "CameraTiming", "Devices", "RotationStage", "StageLimits",
+        "TriggerSource", "TriggerTrain",
     ),
     "beamline.config.devices": ("CameraDriver",),
     "drivers.epics.channel": ("ProcessVariable", "open_channel"),
@@ -121,7 +148,7 @@ def required(value: Any, *, method: bool = False) -> str:
     Args:
         method: leave the first one out.
     """
-    if not callable(value) or (inspect.isclass(value) and not _has_parameters(value)):
+    if not callable(value) or hasattr(value, "__origin__") or (inspect.isclass(value) and not _has_parameters(value)):
         return ""
     parameters = list(inspect.signature(value).parameters.values())[1 if method else 0 :]
     needed = [each for each in parameters if each.default is each.empty and each.kind not in _SEVERAL]

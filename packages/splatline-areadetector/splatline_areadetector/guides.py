@@ -183,7 +183,7 @@ class PandaGuide(_ByNumbers):
 
     told_by = "panda"
 
-    def __init__(self, ride: RideSection, angles: PandaAngles, wait: float = 10.0) -> None:
+    def __init__(self, ride: RideSection, angles: PandaAngles, wait: float = 2.0) -> None:
         super().__init__(ride, np.full(angles.views, np.nan))
         self._settings, self._wait, self._rows = angles, wait, np.empty(0)
 

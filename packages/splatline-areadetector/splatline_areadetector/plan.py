@@ -101,11 +101,7 @@ def _plan_of(plan: RidePlan) -> ScanPlan:
 
 
 def ready_of(config: RideConfig, plan: RidePlan, first: ArrayFrame, runs: Path) -> ReadyScan:
-    """The ridden scan ready to be recorded, by its plan and its first frame.
-
-    Raises:
-        ConfigError: the optics and the frame contradict each other.
-    """
+    """The ridden scan ready to be recorded, by its plan and its first frame."""
     shape, binning = first.window.shape, first.window.binning
     bits = config.ride.bits or 8 * first.dtype.itemsize
     timing = CameraTiming(shape, plan.period or 0.0, 0.0, 0.0, bits)

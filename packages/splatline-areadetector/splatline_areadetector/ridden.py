@@ -115,6 +115,8 @@ class RiddenFrames:
                     self._sink(Warned(f"{self._stream.name}: its server has gone. The ride waits for it."))
                 case Overflow(unique_id):
                     self._overflowed.add(unique_id)
+                    if (lost := self._sorter.pass_over(unique_id)) and self._last is not None:
+                        self._gaps.append(Gap(lost, self._last.time, self._last.time))
                 case Refused(unique_id, why):
                     raise DataError(
                         f"Frame {unique_id} of {self._stream.name} cannot be stored: {why}. What came before is in "
@@ -254,7 +256,7 @@ class RiddenFrames:
         if not self._stream.answers():
             raise InstrumentError(
                 f"{self._stream.name}: no frame for {self._by.silence:g} s, and its server does not answer. What came "
-                "before is in the file."
+                f"before is in the file.{self._told()}"
             )
         why = silence_told(self._by.counters)
         self._sink(Warned(f"No frame for {self._by.silence:g} s, the server answers: {why}."))

@@ -101,13 +101,13 @@ class Sorter:
             return Outside()
         if phase.serial != self._serial or current is None:
             return self._begin(unique_id, phase)
-        if unique_id == current.last_id:
-            self.repeats += 1
-            return Outside(repeated=True)
         trigger = unique_id - current.first_id
         if fell or trigger >= current.n or self._closed:
             self._closed = True
             return Outside()
+        if unique_id == current.last_id:
+            self.repeats += 1
+            return Outside(repeated=True)
         skipped = range(current.last_id + 1 - current.first_id, trigger)
         current.last_id = unique_id
         current.triggers.add(trigger)
@@ -138,6 +138,15 @@ class Sorter:
         current = self._taken[self._now]
         current.first_id -= steps
         current.triggers = {trigger + steps for trigger in current.triggers}
+
+    def pass_over(self, unique_id: int) -> range:
+        """Frames up to this number of the present block will not come; the numbers of those that had not come yet."""
+        current = self._taken.get(self._now)
+        if current is None or self._closed or not current.last_id < unique_id < current.first_id + current.n:
+            return range(0)
+        lost = range(current.last_id + 1, unique_id + 1)
+        current.last_id = unique_id
+        return lost
 
     def lose(self, place: Place) -> None:
         """The frame at this place cannot be used."""

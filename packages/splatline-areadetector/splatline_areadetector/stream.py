@@ -157,9 +157,9 @@ class FrameStream:
             self._changed.notify()
 
     def answers(self) -> bool:
-        """Whether the server answers now; waits 3 s at most."""
+        """Whether the server answers now; waits 1.5 s at most."""
         try:
-            self._get("field(uniqueId)", ANSWERS_WITHIN)
+            self._get("field(uniqueId)", ANSWERS_WITHIN / 2)
         except (BeamlineError, DeviceTimeout):
             return False
         return True

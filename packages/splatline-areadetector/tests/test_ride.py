@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -77,6 +79,42 @@ def test_tomoscan_tells_kinds_and_angles(tmp_path: Path, restarted: bool) -> Non
     )
     assert np.allclose(file.seconds, np.where(file.kinds == 0, 0.03, 0.01))
     assert any("of no scan" in text for text in told.before)
+
+
+class _ByChannelAccess(FakeIoc):
+    """A fake IOC whose tomoscan is another program, which answers Channel Access."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        words = [sys.executable, str(Path(__file__).with_name("fake_tomoscan.py")), "C:TomoScan:"]
+        self.server = subprocess.Popen(words, stdin=subprocess.PIPE, text=True)
+
+    def tomoscan(self, **values: float | str) -> None:
+        assert self.server.stdin is not None
+        self.server.stdin.writelines(f"{name}={value}\n" for name, value in values.items())
+        self.server.stdin.flush()
+        time.sleep(0.3)
+
+    def __exit__(self, *error: object) -> None:
+        self.server.kill()
+        self.server.communicate()
+        super().__exit__(*error)
+
+
+@pytest.mark.slow
+def test_tomoscan_by_channel_access(tmp_path: Path) -> None:
+    pytest.importorskip("caproto")
+    angles = {"from": "tomoscan", "prefix": "ca://C:TomoScan:"}
+    with _ByChannelAccess() as ioc:
+        config = config_of(tmp_path, ioc.url, angles, exposure_s=None)
+        for _ in range(10):  # until it serves
+            told = ride_along(config, tmp_path, lambda stop: _tomoscan(ioc, stop, restarted=False))
+            if not isinstance(told.error, DeviceTimeout):
+                break
+    assert told.error is None
+    (file,) = stored(tmp_path)
+    assert file.kinds.tolist() == [2] * 3 + [1] * 4 + [0] * 8 + [1] * 4 and file.ids.tolist() == [*range(101, 120)]
+    assert np.allclose(file.degrees[file.of(0)], 10 + 0.75 * np.arange(8))
 
 
 def test_kinds_by_the_attribute_of_the_file_plugin(tmp_path: Path) -> None:

@@ -1,0 +1,151 @@
+"""NTNDArrays as frames: pixels by codec, window, attributes; the stream that holds them."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+from fake_ioc import FakeIoc, array_value, counts_of
+
+from beamline.core.errors import ConfigError
+from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError, Window, array_frame
+from splatline_areadetector.codecs import decoded
+from splatline_areadetector.stream import FrameStream, Item, Overflow, Queues, Refused, image_problem
+
+SMOOTH = np.arange(256 * 128).reshape(256, 128) // 300
+CODECS = {  # the filter of HDF5, and the bytes of its header that areaDetector leaves out
+    "bslz4": (hdf5plugin.Bitshuffle(), 12),
+    "lz4": (hdf5plugin.LZ4(), 16),
+    "lz4hdf5": (hdf5plugin.LZ4(), 0),
+    "blosc": (hdf5plugin.Blosc(), 0),
+}
+
+
+def _compressed(codec: str, counts: np.ndarray) -> np.ndarray:
+    """As a file has it, without the header."""
+    made_by, header = CODECS[codec]
+    with h5py.File("made", "w", driver="core", backing_store=False) as file:
+        held = file.create_dataset("made", data=counts, chunks=counts.shape, **made_by)
+        mask, chunk = held.id.read_direct_chunk((0, 0))
+    assert mask == 0  # it was compressed
+    return np.frombuffer(chunk, np.uint8)[header:]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("codec", CODECS)
+def test_codecs(codec: str, dtype: Any) -> None:
+    counts = SMOOTH.astype(dtype)
+    value = array_value(
+        _compressed(codec, counts)[None], 3, codec={"name": codec, "parameters": {np.uint8: 5, np.uint16: 6}[dtype]}
+    )
+    value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 1, "reverse": False} for n in (128, 256)]
+    frame = array_frame(value, 0.0)
+    assert frame is not None and frame.codec == codec and np.array_equal(frame.counts(), counts)
+    assert frame.counts().dtype == np.uint16
+
+
+def test_chunks_of_a_file_with_their_header_are_decoded_too() -> None:
+    with h5py.File("made", "w", driver="core", backing_store=False) as file:
+        held = file.create_dataset("made", data=SMOOTH, chunks=SMOOTH.shape, dtype="u2", **hdf5plugin.Bitshuffle())
+        _, chunk = held.id.read_direct_chunk((0, 0))
+    assert np.array_equal(decoded("bslz4", np.frombuffer(chunk, np.uint8), SMOOTH.shape, np.dtype("u2")), SMOOTH)
+
+
+def test_a_damaged_frame_says_so() -> None:
+    with pytest.raises(ValueError, match="its bslz4 pixels cannot be decoded"):
+        decoded("bslz4", np.zeros(20, np.uint8), (4, 4), np.dtype("u2"))
+
+
+def test_window_and_attributes() -> None:
+    value = array_value(counts_of(4), 4, {"SampleRotary": 12.5}, seconds=1.7e9 + 0.25)
+    sides = ((24, 6, 2, True), (16, 10, 2, False))
+    value.dimension = [{"size": n, "offset": o, "fullSize": n, "binning": b, "reverse": r} for n, o, b, r in sides]
+    frame = array_frame(value, 5.0)
+    assert frame is not None and frame.window == Window((16, 24), (10, 6), (2, 2), (False, True))
+    assert (frame.unique_id, frame.time, frame.received) == (4, pytest.approx(1.7e9 + 0.25), 5.0)
+    assert frame.attributes == {"ColorMode": 0, "SampleRotary": 12.5}
+    assert np.array_equal(frame.counts(), counts_of(4))
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"codec": {"name": "zfp", "parameters": 6}}, "by zfp, which this program does not know; set Codec1:Comp"),
+        ({"codec": {"name": "blosc", "parameters": 0}}, "its codec blosc does not say the type of its pixels"),
+        ({"attributes": {"ColorMode": 1}}, "its pixels are Bayer, not mono"),
+    ],
+)
+def test_what_is_no_frame_of_counts(changed: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(FrameRefusedError, match=sentence):
+        array_frame(array_value(counts_of(1), 1, **changed), 0.0)
+
+
+def test_three_axes_and_wide_integers_are_refused() -> None:
+    for counts, sentence in ((np.zeros((3, 4, 4), np.uint16), "dimensions"), (np.zeros((4, 4), np.uint32), "uint32")):
+        with pytest.raises(FrameRefusedError, match=sentence):
+            array_frame(array_value(counts, 1), 0.0)
+
+
+def test_the_queue_is_about_a_second_and_at_most_512_mb() -> None:
+    queues = Queues()
+    assert queues.frames(43_200, 0.02) == 51 and queues.frames(43_200, None) == 100
+    assert queues.frames(8_388_608, 0.01) == 61 and queues.frames(400_000_000, 0.1) == 4
+
+
+def test_addresses() -> None:
+    assert image_problem("ca://P:Pva1:Image") and image_problem("pva://") and not image_problem("pva://P:Pva1:Image")
+    with pytest.raises(ConfigError, match="names no image; expected pva://PREFIX:Pva1:Image"):
+        FrameStream("P:Pva1:Image")
+
+
+def _taken(stream: FrameStream, n: int) -> list[Item]:
+    items = [stream.next(5.0) for _ in range(n)]
+    assert all(item is not None for item in items)
+    return [item for item in items if item is not None]
+
+
+@pytest.mark.usefixtures("loopback")
+def test_a_stream_marks_what_was_there_and_survives_what_it_cannot_read() -> None:
+    with FakeIoc() as ioc:
+        ioc.post(array_value(counts_of(5), 5))
+        with FrameStream(ioc.url) as stream:
+            ioc.post(array_value(np.zeros((4, 4)), 6))
+            ioc.post(array_value(counts_of(7), 7))
+            old, refused, new = _taken(stream, 3)
+            assert isinstance(old, ArrayFrame) and old.is_current and stream.first is not None
+            assert isinstance(refused, Refused) and refused.unique_id == 6 and "float64" in refused.why
+            assert isinstance(new, ArrayFrame) and not new.is_current and stream.answers()
+            stream.put_back(new)
+            assert stream.next(0.0) is new and stream.next(0.05) is None
+
+
+@pytest.mark.usefixtures("loopback")
+def test_a_callback_that_raises_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An exception in p4p's callback would end the subscription with a line in a log."""
+    with FakeIoc() as ioc, FrameStream(ioc.url) as stream:
+        time.sleep(0.2)
+        with monkeypatch.context() as broken:
+            broken.setattr("splatline_areadetector.stream.array_frame", lambda *given: 1 / 0)
+            ioc.post(array_value(counts_of(1), 1))
+            time.sleep(0.3)
+        ioc.post(array_value(counts_of(2), 2))
+        came = [item for item in _taken(stream, 3) if not getattr(item, "is_current", False)]
+    assert isinstance(came[0], Refused) and "ZeroDivisionError" in came[0].why
+    assert isinstance(came[1], ArrayFrame) and came[1].unique_id == 2
+
+
+@pytest.mark.usefixtures("loopback")
+def test_a_full_ring_names_what_it_had_no_room_for_and_several_clients_lose_nothing() -> None:
+    small = Queues(ring_megabytes=3 * counts_of(1).nbytes / 1e6)
+    with FakeIoc() as ioc, FrameStream(ioc.url) as whole, FrameStream(ioc.url, small) as stream:
+        time.sleep(0.2)
+        ioc.send(range(1, 7), 0.02)
+        time.sleep(0.3)
+        ids = [item.unique_id for item in _taken(whole, 7) if isinstance(item, ArrayFrame) and not item.is_current]
+        items = _taken(stream, 7)
+    assert ids == [*range(1, 7)]
+    assert [item.unique_id for item in items if isinstance(item, Overflow)] == [3, 4, 5, 6]  # beside the old frame

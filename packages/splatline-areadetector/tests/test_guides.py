@@ -1,0 +1,158 @@
+"""What tells kinds and angles: histories of variables, tomoscan's status, attributes, a PandABox's file."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from fake_ioc import TOMOSCAN, FakeIoc, array_value, counts_of
+from ridden import config_of
+
+from beamline.core.errors import ConfigError
+from drivers.base.errors import DeviceTimeout
+from drivers.base.frame import FrameKind
+from splatline_areadetector.arrays import ArrayFrame, array_frame
+from splatline_areadetector.guides import TomoscanGuide, guide_of, kind_of
+from splatline_areadetector.sorter import NO_SCAN, Phase
+from splatline_areadetector.variables import History, Variables, url_problem
+
+CLIENT = """
+from caproto.server import PVGroup, pvproperty, run
+from caproto import ChannelType
+class Group(PVGroup):
+    status = pvproperty(value=b"Collecting flat fields", name="ScanStatus", dtype=ChannelType.CHAR, max_length=256)
+    kind = pvproperty(value="FlatField", name="FrameType", dtype=ChannelType.ENUM,
+                      enum_strings=["DarkField", "FlatField", "Projection"])
+    start = pvproperty(value=3.5, name="RotationStart")
+run(Group(prefix="C:").pvdb, interfaces=["127.0.0.1"], log_pv_names=False)
+"""
+
+
+def _frame(unique_id: int, seconds: float = 0.0, received: float = 0.0, **attributes: Any) -> ArrayFrame:
+    frame = array_frame(array_value(counts_of(1), unique_id, attributes, seconds), received)
+    assert frame is not None
+    return frame
+
+
+def test_words_of_kinds() -> None:
+    words = {"/exchange/data_white": 1, "DarkField": 2, "Projection": 0, "/exchange/data": 0, "flat": 1}
+    assert {word: kind_of(word) for word in words} == {word: FrameKind(n) for word, n in words.items()}
+    assert kind_of("bubbles") is None and kind_of(3) is None
+
+
+def test_a_history_counts_from_the_iocs_times() -> None:
+    """What came all at once, as this computer stood still, is in its order; the first value was there before."""
+    history = History(lambda: 110.0)
+    for stamp, value in ((5.0, "a"), (100.0, "b"), (102.0, "c")):
+        history.add(stamp, value)
+    assert [[*history.until(seconds)] for seconds in (1, 99, 101, 103)] == [["a"], ["a"], ["a", "b"], ["a", "b", "c"]]
+    assert history.delay == 8.0 and history.last == "c" and history.changed_at == 102.0
+    counter = History(lambda: 10.0)
+    for stamp, number in ((1.0, 5.0), (8.0, 6.0), (9.0, 9.0)):
+        counter.add(stamp, number)
+    assert counter.rise(7.0, 8.5) == 1.0 and counter.rise(8.5, 9.5) == 3.0
+    assert History().rise(0, 1) is None
+
+
+def test_a_clock_that_was_never_set_is_not_believed() -> None:
+    history = History(lambda: 1.7e9)
+    history.add(0.0, 1.0)
+    history.add(0.0, 2.0)
+    assert history.changed_at == 1.7e9
+
+
+@pytest.mark.usefixtures("loopback")
+def test_tomoscans_kinds_although_its_clock_is_half_an_hour_off(tmp_path: Path) -> None:
+    with FakeIoc() as ioc:
+        ioc.tomoscan(**TOMOSCAN)
+        config = config_of(tmp_path, ioc.url, {"from": "tomoscan", "prefix": "pva://T:TomoScan:"}, exposure_s=None)
+        guide = guide_of(config.ride)
+        assert isinstance(guide, TomoscanGuide)
+        assert guide.phase(_frame(1, time.time() - 1800, time.time())) == NO_SCAN and guide.ended(math.inf)
+        for status, kind, frame_type in (
+            ("Collecting dark fields", FrameKind.DARK, "DarkField"),
+            ("Programming PSO", FrameKind.DARK, "DarkField"),
+            ("Collecting projections", None, "DarkField"),  # FrameType changes just before the first frame
+            ("Collecting projections", FrameKind.PROJECTION, "Projection"),
+            ("Aborting scan", None, "Projection"),
+        ):
+            ioc.tomoscan(ScanStatus=status, FrameType=frame_type)
+            time.sleep(0.2)
+            now = time.time()
+            assert guide.phase(_frame(1, now - 1800, now)).kind is kind
+        plan = guide.plan()
+        guide.close()
+    assert [(block.kind, block.n) for block in plan.blocks] == [(2, 3), (1, 4), (0, 8), (1, 4)]
+    assert np.allclose(np.degrees(plan.angles), 10 + 0.5 * np.arange(8))
+    assert (plan.exposure(FrameKind.FLAT), plan.exposure(FrameKind.DARK)) == (0.01, 0.03)
+
+
+def test_kinds_by_order_and_by_attribute(tmp_path: Path) -> None:
+    fields = {"darks": {"count": 2, "at": "both"}}
+    angles = {"from": "attribute", "views": 3}
+    guide = guide_of(config_of(tmp_path, "pva://P:I", angles, **fields).ride)
+    kinds = [guide.phase(_frame(i, SampleRotary=1.0 * i)).kind for i in range(7, 15)]
+    assert kinds == [2, 2, 0, 0, 0, 2, 2, None]
+    assert guide.angle(_frame(9, SampleRotary=90.0), 0) == pytest.approx(math.pi / 2)
+    with pytest.raises(ConfigError, match="SampleRotary, an attribute that the frames do not have; they have ColorM"):
+        guide.phase(_frame(9))
+    guide = guide_of(config_of(tmp_path, "pva://P:I", angles, kinds="K").ride)
+    told = [guide.phase(_frame(i, SampleRotary=1.0, K=word)) for i, word in enumerate(("flat", "data", "data", "x"))]
+    assert told == [Phase(1, FrameKind.FLAT), Phase(2, FrameKind.PROJECTION), Phase(2, FrameKind.PROJECTION),
+                    Phase(3, None)]  # fmt: skip
+
+
+def test_a_pandaboxs_file_is_followed(tmp_path: Path) -> None:
+    """Row n is trigger n; a row that does not come is no angle."""
+    path = tmp_path / "panda.h5"
+    angles = {"from": "panda", "views": 4, "file": str(path), "dataset": "/INENC1.VAL.Value", "deg_per_unit": 0.5}
+    guide: Any = guide_of(config_of(tmp_path, "pva://P:I", angles).ride)
+    guide._wait = 0.5
+    with h5py.File(path, "w", libver="latest") as file:
+        rows = file.create_dataset("INENC1.VAL.Value", data=[10.0, 20.0], maxshape=(None,), chunks=(16,))
+        file.swmr_mode = True
+        assert np.degrees(guide.angle(_frame(1), 1)) == pytest.approx(10.0)
+        rows.resize(3, 0)
+        rows[2] = 30.0
+        file.flush()
+        assert np.degrees(guide.angle(_frame(1), 2)) == pytest.approx(15.0)
+        assert math.isnan(guide.angle(_frame(1), 3))
+
+
+@pytest.mark.usefixtures("loopback")
+def test_variables_that_do_not_answer() -> None:
+    assert url_problem("http://x") and url_problem("ca://") and not url_problem("ca://2bma:")
+    with FakeIoc() as ioc:
+        ioc.put({"a": 2.5, "b": "text"})
+        with Variables("pva://T:", ("a", "b", "c"), ("a",)) as there:
+            assert (there.number("a"), there.text("b"), there.number("c"), there.text("c")) == (2.5, "text", None, "")
+        with pytest.raises(DeviceTimeout, match="T:c"):
+            Variables("pva://T:", ("a", "c"), ("c",))
+
+
+@pytest.mark.slow
+def test_text_and_labels_by_channel_access(loopback: dict[str, str]) -> None:
+    """tomoscan's ScanStatus is an array of characters."""
+    pytest.importorskip("caproto")
+    server = subprocess.Popen([sys.executable, "-c", CLIENT])
+    try:
+        deadline = time.monotonic() + 60
+        while True:
+            try:
+                there = Variables("ca://C:", ("ScanStatus", "FrameType", "RotationStart"), ("ScanStatus", "FrameType"))
+                break
+            except DeviceTimeout:
+                assert time.monotonic() < deadline
+        with there:
+            assert there.text("ScanStatus") == "Collecting flat fields" and there.text("FrameType") == "FlatField"
+            assert there.number("RotationStart") == 3.5
+    finally:
+        server.kill()
+        server.wait()

@@ -1,0 +1,258 @@
+"""A ride on the simulator of APS (pvapy), as programs: a real scan, a ride that stands still, a server that dies."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from ridden import Stored, stored
+from scipy.ndimage import zoom
+
+from drivers.base.frame import FrameKind
+
+pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("loopback")]
+CHANNEL = "P:Pva1:Image"
+MINUTE = 600  # frames, at 10 a second
+DISK = """
+import sys, time
+import beamline.storage.writers.rows as rows
+write = rows.Rows.write
+def slow(self, frame, *more):
+    time.sleep(frame.counts.nbytes / {bytes_per_s})
+    return write(self, frame, *more)
+rows.Rows.write = slow
+from beamline.cli.main import run
+run()
+"""
+
+
+@pytest.fixture
+def scan(shared_data: Path) -> Path:
+    return shared_data / "diamond_24737_parallel_91x135x160.h5"
+
+
+@contextmanager
+def served(source: Path, fps: float, seconds: float, delay: float, dataset: str = "/exchange/data") -> Iterator[None]:
+    """The simulator's frames, over and over, from `delay` s on."""
+    pytest.importorskip("pvapy")
+    words = f"-if {source} -hds {dataset} -fps {fps} -cn {CHANNEL} -std {delay} -rt {seconds} -rp 100000 -dc -shd 1"
+    run = [sys.executable, "-m", "pvapy.cli.adSimServer", *words.split()]
+    server = subprocess.Popen(run, stdout=subprocess.DEVNULL)
+    try:
+        time.sleep(2)
+        yield
+    finally:
+        server.kill()
+        server.wait()
+
+
+class Ride:
+    """`beamline ride` as a program, whose output is in a file."""
+
+    def __init__(self, folder: Path, *options: str, program: str = "", **ride: object) -> None:
+        section = {"image": f"pva://{CHANNEL}", "exposure_s": 0.01, "silence_s": 20, **ride}
+        config = {"sample": {"name": "s"}, "ride": section, "optics": {"pixel_size_um": 1}}
+        (folder / "my.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+        words = ["ride", str(folder / "my.yaml"), "-o", str(folder / "runs"), *options]
+        begin = ["-c", program] if program else ["-m", "beamline.cli.main"]
+        self.folder, self._output = folder, folder / "output.txt"
+        self._stream: IO[str] = self._output.open("w")
+        self.process = subprocess.Popen(
+            [sys.executable, *begin, *words], stdout=self._stream, stderr=subprocess.STDOUT, text=True
+        )
+
+    @property
+    def output(self) -> str:
+        return self._output.read_text(encoding="utf-8")
+
+    def wait_for(self, reached: Callable[[], bool], seconds: float = 120.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not reached():
+            assert time.monotonic() < deadline and self.process.poll() is None, self.output
+            time.sleep(0.1)
+
+    def frames(self) -> int:
+        """In the file so far."""
+        for path in (self.folder / "runs").glob("*/scan.h5"):
+            try:
+                with h5py.File(path, "r", swmr=True) as file:
+                    return int(file["/entry/progress/frames_committed"][()])
+            except (OSError, KeyError):
+                return 0
+        return 0
+
+    def end(self, seconds: float = 400.0) -> int:
+        code = self.process.wait(seconds)
+        self._stream.close()
+        return code
+
+
+def _views(n: int) -> dict[str, object]:
+    return {"angles": {"from": "plan", "views": n, "start_deg": 0, "step_deg": 2}}
+
+
+def _equal_to_the_bit(file: Stored, source: Path) -> None:
+    """Each frame once, in order, with the pixels of its number and the angle of its trigger."""
+    with h5py.File(source) as scan:
+        frames = scan["/exchange/data"][()]
+    views = file.of(FrameKind.PROJECTION)
+    ids = file.ids[views]
+    assert (np.diff(ids) > 0).all()
+    assert np.array_equal(file.counts[views], frames[(ids - 1) % len(frames)])
+    assert np.allclose(file.degrees[views], 2.0 * file.triggers[views])
+    assert np.array_equal(file.triggers[views] - file.triggers[views][0], ids - ids[0])
+
+
+@pytest.mark.parametrize(("fps", "seconds"), [(10, 120), (50, 120)])
+@pytest.mark.slow
+def test_every_frame_of_two_minutes(tmp_path: Path, scan: Path, fps: int, seconds: int) -> None:
+    n = fps * seconds
+    with served(scan, fps, seconds + 5, 40):
+        ride = Ride(tmp_path, "--no-live", "--darks", str(scan), "--flats", str(scan), **_views(n))
+        assert ride.end() in (0, 7), ride.output  # 7: the monitor sees that the scan comes over and over
+    (file,) = stored(tmp_path)
+    _equal_to_the_bit(file, scan)
+    assert file.ids.tolist() == [-1, -1, *range(1, n + 1)] and file.status == "complete"
+
+
+@pytest.mark.slow
+def test_the_volume_grows_and_is_that_of_the_file(tmp_path: Path, scan: Path) -> None:
+    """The live volume has all views, as that of the finished file; a picture of it comes while the scan runs."""
+    with served(scan, 1.5, 75, 40):
+        ride = Ride(tmp_path, "--darks", str(scan), "--flats", str(scan), period_s=0.7, **_views(91))
+        live = list[bool]()
+
+        def picture() -> bool:
+            (folder,) = (tmp_path / "runs").glob("*/") if list((tmp_path / "runs").glob("*/")) else (tmp_path,)
+            live.append((folder / "recon.live.png").exists())
+            return live[-1]
+
+        ride.wait_for(picture, 300)
+        during = ride.frames()
+        assert ride.end(600) in (0, 7), ride.output
+    (run,) = (tmp_path / "runs").glob("*/")
+    _equal_to_the_bit(stored(tmp_path)[0], scan)
+    assert during < 93, "the picture came after the last frame"
+    command = [sys.executable, "-m", "beamline.cli.main", "recon", str(run / "scan.h5"), "-o", str(tmp_path / "r.h5")]
+    subprocess.run([*command, "-m", "r2", "--seed", "0"], check=True, capture_output=True)
+    volumes = []
+    for path in (run / "recon.h5", tmp_path / "r.h5"):
+        with h5py.File(path) as file:
+            volumes.append(np.asarray(next(file[name] for name in ("/entry/data/data", "/volume") if name in file)))
+    live_volume, finished = volumes
+    assert live_volume.shape == finished.shape
+    assert np.corrcoef(live_volume.ravel(), finished.ravel())[0, 1] > 0.98
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no process is stopped there by a signal")
+@pytest.mark.parametrize("still", [1, 5])
+@pytest.mark.slow
+def test_a_ride_that_stands_still(tmp_path: Path, scan: Path, still: int) -> None:
+    """A second is bridged by the server's queue; of five what is lost is named, and nothing comes twice."""
+    with served(scan, 50, 24, 40):
+        ride = Ride(tmp_path, "--no-live", period_s=0.02, **_views(1000))
+        ride.wait_for(lambda: ride.frames() > 50)
+        ride.process.send_signal(signal.SIGSTOP)
+        time.sleep(still)
+        ride.process.send_signal(signal.SIGCONT)
+        code = ride.end()
+    (file,) = stored(tmp_path)
+    _equal_to_the_bit(file, scan)
+    missing = sorted({*range(1000)} - {*(file.ids - 1).tolist()})
+    assert file.missing == missing and (still > 1 or not missing) and len(missing) < 50 * (still - 1) + 1
+    if missing:
+        assert code == 5 and "were lost by this program, which stood still for" in ride.output, ride.output
+
+
+@pytest.mark.slow
+def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, scan: Path) -> None:
+    ride = None
+    with served(scan, 20, 60, 40):
+        ride = Ride(tmp_path, "--no-live", **_views(300))
+        ride.wait_for(lambda: ride.frames() > 20)
+    time.sleep(1)
+    with served(scan, 20, 40, 1):
+        assert ride.end() == 5
+    assert "its server has gone" in ride.output and "began anew at" in ride.output
+    first, second = stored(tmp_path)
+    assert first.status == "failed" and second.status == "complete" and second.ids.tolist() == [*range(1, 301)]
+    for file in (first, second):
+        _equal_to_the_bit(file, scan)
+
+
+@pytest.mark.parametrize("ring", [2048.0, 20.0])
+@pytest.mark.slow
+def test_a_disk_of_5_mb_s(tmp_path: Path, scan: Path, ring: float) -> None:
+    """Frames of 0.69 MB at 20 a second: 13.8 MB/s. A ring that is large enough loses none."""
+    with h5py.File(scan) as file, h5py.File(tmp_path / "large.h5", "w") as large:
+        large["/exchange/data"] = np.array([zoom(each, 4, order=0) for each in file["/exchange/data"][:30]])
+    with served(tmp_path / "large.h5", 20, 20, 45):
+        program = DISK.format(bytes_per_s=5e6)
+        ride = Ride(tmp_path, "--no-live", program=program, ring_mb=ring, period_s=0.05, **_views(300))
+        code = ride.end()
+    (file,) = stored(tmp_path)
+    _equal_to_the_bit(file, tmp_path / "large.h5")
+    assert file.missing == sorted({*range(300)} - {*(file.ids - 1).tolist()})
+    assert code in (0, 7) or "whose ring was full: the disk is too slow (ride.ring_mb)" in ride.output, ride.output
+    if ring > 1000:
+        assert not file.missing
+
+
+@pytest.mark.slow
+def test_a_ride_that_is_killed_is_recovered(tmp_path: Path, scan: Path) -> None:
+    with served(scan, 20, 40, 40):
+        ride = Ride(tmp_path, "--no-live", **_views(600))
+        ride.wait_for(lambda: ride.frames() > 30)
+        committed = ride.frames()
+        ride.process.kill()
+        ride.end()
+    (run,) = (tmp_path / "runs").glob("*/")
+    subprocess.run([sys.executable, "-m", "beamline.cli.main", "recover", str(run)], check=True, capture_output=True)
+    (file,) = stored(tmp_path)
+    _equal_to_the_bit(file, scan)
+    assert file.ids.tolist() == [*range(1, len(file.ids) + 1)] and len(file.ids) >= committed
+    with h5py.File(run / "scan.h5") as recovered:
+        assert recovered["/exchange/data"].shape == file.counts.shape
+
+
+@pytest.mark.bench
+def test_large_frames_for_a_minute(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
+    """2048 x 2048 x 16 bit at 10 a second, 84 MB/s: none lost. CPU and memory are recorded.
+
+    It needs two free cores and a disk that keeps up.
+    """
+    n = MINUTE
+    psutil = pytest.importorskip("psutil")
+    with h5py.File(tmp_path / "large.h5", "w") as file:
+        noise = np.random.default_rng(0).integers(900, 1100, (4, 2048, 2048))
+        file["/exchange/data"] = noise.astype(np.uint16)
+    with served(tmp_path / "large.h5", 10, n / 10 + 4, 45):
+        ride = Ride(tmp_path, "--no-live", period_s=0.1, **_views(n))
+        process, most, cpu = psutil.Process(ride.process.pid), 0.0, 0.0
+        while ride.process.poll() is None:
+            try:
+                most, cpu = max(most, process.memory_info().rss / 1e9), sum(process.cpu_times()[:2])
+            except psutil.Error:
+                break
+            time.sleep(0.5)
+        code = ride.end()
+    record_property("cpu_s", cpu)
+    record_property("memory_gb", most)
+    print(f"{n} frames of 8.4 MB: {cpu:.1f} s of CPU, {most:.2f} GB at most")
+    (path,) = (tmp_path / "runs").glob("*/scan.h5")
+    with h5py.File(path) as file:
+        ids = file["/entry/frame_log/framestamp"][()]
+        assert ids.tolist() == [*range(1, n + 1)], ride.output
+        rows = [0, n // 2, n - 1]
+        equal = [np.array_equal(file["/entry/instrument/detector/data"][row], noise[row % 4]) for row in rows]
+    assert code in (0, 7) and all(equal), ride.output
