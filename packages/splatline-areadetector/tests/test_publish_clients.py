@@ -11,6 +11,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -23,9 +24,13 @@ from drivers.base.frame import FrameKind
 from splatline_areadetector.publish_frames import PublishedFrame
 from splatline_areadetector.publish_image import ImageServer
 
-pytest.importorskip("softioc")
 HERE = Path(__file__).parent
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+CLIENTS = ("ophyd_async", "pvaccess")  # not imported here: pvapy and p4p bring different libraries of EPICS
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(600),
+    pytest.mark.skipif(not all(map(find_spec, CLIENTS)), reason=f"needs {', '.join(CLIENTS)}"),
+]
 WITHIN = 120.0  # s
 VIEWS = 2000  # more than the scan takes before it is stopped
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import yaml
 
-pytest.importorskip("softioc")
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 BEAMLINE = (sys.executable, "-m", "beamline.cli.main")
 VIEWS = 40
