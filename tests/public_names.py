@@ -29,7 +29,7 @@ FOR_BLUESKY = {
 # What other packages add and prove devices, formats and methods with.
 FOR_PACKAGES = {
     "beamline.cli.options": (
-        "as_scan", "json_events", "json_option", "parsed", "set_option", "volume_argument", "volume_path",
+        "as_scan", "json_events", "json_option", "parsed", "say", "set_option", "volume_argument", "volume_path",
     ),
     "beamline.cli.terminal": ("Answer", "PageBeside", "Terminal", "answering"),
     "beamline.core.errors": (
@@ -78,7 +78,7 @@ FOR_PACKAGES = {
     "beamline.projections.prepare": ("prepare_projections",),
     "beamline.projections.protocols": ("PlaceStep", "ScanPart", "ScanStep", "ViewStep"),
     "beamline.projections.step": ("StepDone", "StepMemory", "option"),
-    "beamline.storage.hdf5": ("created", "open_hdf5", "readable"),
+    "beamline.storage.hdf5": ("created", "look_again", "open_hdf5", "readable"),
     "beamline.storage.frame_table": ("FrameTable",),
     "beamline.storage.readers.base": ("WHOLE", "ScanFormat", "ScanSource", "frame_indices"),
     "beamline.storage.readers.open": ("open_scan",),
@@ -96,6 +96,7 @@ FOR_PACKAGES = {
         "TriggerSource", "TriggerTrain",
     ),
     "beamline.config.devices": ("CameraDriver",),
+    "drivers.epics.channel": ("ProcessVariable", "open_channel"),
     "drivers.stages.settings": ("StageDriver", "StageSettings"),
     "drivers.testing.camera": ("CameraConformance",),
     "drivers.testing.stages": ("StageConformance", "StepStageConformance"),

@@ -16,6 +16,8 @@ from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import Camera, CameraFrame, CameraSettings, TriggerSource
 
+CLOCK_ERROR = 2e-4  # s
+
 
 @dataclass(frozen=True)
 class CameraBench:
@@ -26,6 +28,8 @@ class CameraBench:
         settings: accepted settings: externally triggered, a small region, about 10 ms.
         refused: changes of them that it refuses, and a pattern of the message.
         binnings: its binnings beside 1.
+        time_error: s by which the time of a frame may miss its trigger: more than that of a camera's own clock where
+            another computer tells the time.
     """
 
     camera: Camera
@@ -34,6 +38,7 @@ class CameraBench:
     settings: CameraSettings
     refused: Sequence[tuple[Mapping[str, Any], str]]
     binnings: Sequence[int] = ()
+    time_error: float = CLOCK_ERROR
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -91,7 +96,7 @@ class CameraConformance:
         times = self._pulses(bench, 6)
         frames = self._take(bench, 6)
         assert [frame.framestamp for frame in frames] == list(range(6))
-        assert [frame.time for frame in frames] == pytest.approx(times, abs=2e-4)
+        assert [frame.time for frame in frames] == pytest.approx(times, abs=bench.time_error)
         assert {(frame.counts.shape, frame.counts.dtype) for frame in frames} == {(bench.shape, np.dtype(np.uint16))}
         # A frame cannot arrive before it is exposed and read out.
         assert bench.clock.now() >= times[-1] + bench.settings.exposure + bench.camera.timing.readout - 1e-6
@@ -101,7 +106,7 @@ class CameraConformance:
         times = self._pulses(bench, 9, period=0.6 * bench.camera.timing.min_period)
         frames = self._take(bench, 5)  # every other pulse
         assert [frame.framestamp for frame in frames] == list(range(5))
-        assert [frame.time for frame in frames] == pytest.approx(times[::2], abs=2e-4)
+        assert [frame.time for frame in frames] == pytest.approx(times[::2], abs=bench.time_error)
         with pytest.raises(DeviceTimeout):
             bench.camera.next_frame(timeout=0.2)
 
@@ -116,7 +121,7 @@ class CameraConformance:
             rest.append(bench.camera.next_frame(timeout=1.0))
         assert [frame.framestamp for frame in rest] == list(range(200 - len(rest), 200))
         assert [frame.time - rest[0].time for frame in rest] == pytest.approx(
-            [time - times[-len(rest)] for time in times[-len(rest) :]], abs=2e-4
+            [time - times[-len(rest)] for time in times[-len(rest) :]], abs=bench.time_error
         )
 
     def test_pulses_before_arm_are_lost(self, bench: CameraBench) -> None:
@@ -159,8 +164,9 @@ class CameraConformance:
         frames = self._take(bench, 4)
         assert [frame.framestamp for frame in frames] == [0, 1, 2, 3]
         gaps = np.diff([frame.time for frame in frames])
-        assert (gaps >= bench.settings.exposure - 2e-6).all()  # a camera's clock may tick in microseconds
-        assert gaps == pytest.approx(gaps[0], abs=2e-4)
+        beyond_clock = bench.time_error - CLOCK_ERROR
+        assert (gaps >= bench.settings.exposure - beyond_clock - 2e-6).all()  # its clock may tick in microseconds
+        assert gaps == pytest.approx(gaps[0], abs=bench.time_error)
 
     def test_framestamps_start_anew_with_every_arm(self, bench: CameraBench) -> None:
         bench.camera.configure(replace(bench.settings, trigger=TriggerSource.INTERNAL))

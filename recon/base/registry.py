@@ -24,7 +24,7 @@ _PREFIX = "splatline."
 ADD_ONS = {
     "cluster": "splatline-cluster",
     "emission": "splatline-emission",
-    "ride": "splatline-areadetector",
+    **dict.fromkeys(("area_detector", "publish", "ride"), "splatline-areadetector"),
     **dict.fromkeys(("intratomo", "naf", "sax-nerf"), "splatline-neural"),
     **dict.fromkeys(("render", "surface", "voxelise"), "splatline-models"),
     "tango": "splatline-tango",

@@ -1,0 +1,395 @@
+"""AreaDetectorCamera: a camera behind an EPICS areaDetector, set by its records, with frames by PVAccess.
+
+Its times are those at which its driver had a frame, less exposure and readout: they miss the pulse by milliseconds.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from drivers.base.clock import Clock
+from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
+from drivers.epics.channel import ProcessVariable, open_channel
+from recon.base.setting import setting
+from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError
+from splatline_areadetector.camera_labels import DRIVERS, DriverLabels
+from splatline_areadetector.stream import Disconnected, FrameStream, Item, Overflow, Queues, Refused
+
+_LOOK_EVERY = 0.02  # s, for a readback
+_SETTLED = 0.2  # s for which no frame comes once a camera is stopped
+_LONGEST = 3600.0  # s, exposure
+_LEAST_RING = 2  # frames
+
+
+@dataclass(frozen=True)
+class AreaDetectorSettings:
+    """Of the IOC and its camera; what EPICS cannot tell is stated here."""
+
+    prefix: str = setting(..., "Of the IOC's records, by ca:// or pva://, such as ca://2bmSP2:.")
+    driver: Literal["spinnaker", "simdetector", "pco", "andor3", "hamamatsu", "eiger"] = setting(
+        ..., "Of areaDetector, which the labels of triggers are of."
+    )
+    sensor: tuple[int, int] = setting(..., "Its rows and columns.")
+    readout: float = setting(..., "Of a full frame.", unit="s", gt=0, le=100)
+    electrons_per_count: float = setting(..., "By its data sheet.", gt=0, le=1e6)
+    image: str | None = setting(None, "pva://NAME of the frames; null: PREFIXPva1:Image.")
+    line: str = setting("Line0", "The camera's input for trigger pulses (spinnaker).")
+    min_period: float = setting(0.0, "Between triggers, at least.", unit="s", ge=0, le=100)
+    dead: float = setting(
+        0.0, "Between exposures; readout_s where it does not expose meanwhile.", unit="s", ge=0, le=100
+    )
+    row_period: float = setting(0.0, "From row to row of a rolling shutter; 0: global.", unit="s", ge=0, le=1)
+    bits: int = setting(16, "Of a count.", ge=8, le=16)
+    offset: float = setting(0.0, "Counts without light.", ge=0, le=65535)
+    ring: int = setting(2_000, "Memory for frames that wait.", unit="mb", ge=1, le=1_000_000)
+    timeout: float = setting(5.0, "For an answer of the IOC.", unit="s", gt=0, le=100)
+
+
+class _Records:
+    """The records of an IOC by their names after the prefix, each opened once."""
+
+    def __init__(self, prefix: str, name: str, timeout: float, clock: Clock) -> None:
+        self._prefix, self._name, self._timeout, self._clock = prefix, name, timeout, clock
+        self._opened: dict[str, ProcessVariable] = {}
+
+    def read(self, record: str) -> float | str:
+        (value,) = self._channel(record).read("")
+        return value.label or value.value
+
+    def write(self, record: str, value: float | str) -> None:
+        self._channel(record).write("", value)
+
+    def set(self, record: str, value: float | str, within: float = 0.01) -> float | str:
+        """Write a value, and wait for its readback; a number may differ by this share. The readback."""
+        self.write(record, value)
+        return self.await_value(record, value, within)
+
+    def await_value(self, record: str, value: float | str, within: float = 0.01) -> float | str:
+        """Wait until the readback is this value. Raises DeviceRefused if it does not come to be."""
+        deadline = self._clock.now() + self._timeout
+        while not _is_near(shown := self.read(f"{record}_RBV"), value, within):
+            if self._clock.now() > deadline:
+                raise DeviceRefused(
+                    self._name, f"{record} did not take {value!r}", request=f"{self._prefix}{record} = {value}",
+                    reply=f"{record}_RBV is {shown!r}", state="Other settings may have changed",
+                    advice="Try it in the camera's control screen, and check `driver`",
+                )  # fmt: skip
+            self._clock.sleep(_LOOK_EVERY)
+        return shown
+
+    def close(self) -> None:
+        for channel in self._opened.values():
+            channel.close()
+
+    def _channel(self, record: str) -> ProcessVariable:
+        if record not in self._opened:
+            self._opened[record] = open_channel(f"{self._prefix}{record}", self._name, self._timeout)
+        return self._opened[record]
+
+
+def _is_near(shown: float | str, value: float | str, within: float) -> bool:
+    if isinstance(shown, str) or isinstance(value, str):
+        return shown == value or (isinstance(shown, str) and shown in _SWITCHED.get(value, ()))
+    return abs(shown - value) <= within * abs(value) + 1e-9
+
+
+_SWITCHED: dict[float | str, tuple[str, ...]] = {
+    0: ("No", "Disable", "Off", "Done"), 1: ("Yes", "Enable", "On", "Acquire", "Acquiring"),
+}  # fmt: skip
+"""Labels of switches, which are written as 0 or 1."""
+
+
+class AreaDetectorCamera:
+    """Implements drivers.base.protocols.Camera. See `AreaDetectorSettings`.
+
+    Framestamps are the numbers that its driver gives frames, from 0 at arm: a lost frame leaves a gap. Where the camera
+    counts them (spinnaker, hamamatsu), the loss of the very first one shows in the frames that are missing at the end.
+    One thread takes frames; another may call `disarm` or `close`, which end its wait.
+
+    Raises:
+        DeviceTimeout, DeviceError: the IOC does not answer, or its image cannot be taken.
+        DeviceRefused: its sensor is another one than configured, or a plugin shows the image in part.
+    """
+
+    Settings = AreaDetectorSettings
+
+    def __init__(self, settings: AreaDetectorSettings, clock: Clock) -> None:
+        self.name, self._own, self._clock = "camera", settings, clock
+        self._labels: DriverLabels = DRIVERS[settings.driver]
+        self._records = _Records(settings.prefix, self.name, settings.timeout, clock)
+        self._changed = threading.Condition()
+        self._ring = deque[CameraFrame]()
+        self._ring_size, self._lost, self._overrun = _LEAST_RING, 0, 0
+        self._problem: DeviceError | None = None
+        self._origin: int | None = None
+        self._armed, self._closed = False, False
+        try:
+            self._refuse_other_sensor()
+            self._settings = CameraSettings(float(self._records.read("cam1:AcquireTime_RBV")), TriggerSource.INTERNAL)
+            image = settings.image or f"pva://{settings.prefix.partition('://')[2]}Pva1:Image"
+            self._stream = FrameStream(image, Queues(ring_megabytes=1e-6 * settings.ring), within=settings.timeout)
+        except FrameRefusedError as error:
+            self._records.close()
+            raise DeviceError(self.name, f"its image cannot be taken: {error}", state="Nothing was set") from error
+        except BaseException:
+            self._records.close()
+            raise
+        self._collector = threading.Thread(target=self._collect, name="frames of areaDetector", daemon=True)
+        self._collector.start()
+
+    @staticmethod
+    def timing_of(settings: AreaDetectorSettings, wanted: CameraSettings) -> CameraTiming:
+        """The timing by the configuration. Raises ValueError for what it would refuse."""
+        rows, cols = settings.sensor
+        if not 0 < wanted.exposure <= _LONGEST:
+            raise ValueError(f"an exposure of {wanted.exposure:g} s is not possible; expected up to {_LONGEST:g} s")
+        if wanted.readout != "standard":
+            raise ValueError(f"readout {wanted.readout!r} is unknown; legal: standard")
+        row0, col0, height, width = wanted.roi or (0, 0, rows, cols)
+        if row0 + height > rows or col0 + width > cols:
+            raise ValueError(f"roi {list(wanted.roi or ())} reaches beyond the sensor of {rows} x {cols} pixels")
+        if height % wanted.binning or width % wanted.binning:
+            raise ValueError(f"{height} x {width} pixels are not divided by binning {wanted.binning}")
+        shape = height // wanted.binning, width // wanted.binning
+        period = max(settings.min_period, wanted.exposure + settings.dead)
+        return CameraTiming(shape, period, settings.readout, settings.row_period, settings.bits)
+
+    @property
+    def timing(self) -> CameraTiming:
+        self._require_open()
+        return self.timing_of(self._own, self._settings)
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        """Set the records and read them back; the exposure may differ by the camera's rounding.
+
+        Raises:
+            DeviceRefused: it cannot, or is armed; the earlier settings stay.
+        """
+        self._require_open()
+        if self._armed:
+            raise DeviceRefused(self.name, "it is armed and cannot be configured", advice="disarm() it first")
+        try:
+            self.timing_of(self._own, settings)
+        except ValueError as error:
+            raise DeviceRefused(self.name, str(error), state="Its settings are as they were") from error
+        try:
+            self._settings = self._applied(settings)
+        except DeviceError:
+            with suppress(DeviceError):
+                self._applied(self._settings)
+            raise
+        return self._settings
+
+    def arm(self, n_frames: int) -> None:
+        """Wait for triggers; framestamps start at 0.
+
+        Raises:
+            DeviceRefused: it is armed already, or n_frames < 1.
+        """
+        self._require_open()
+        if self._armed:
+            raise DeviceRefused(self.name, "it is armed already", advice="disarm() it first")
+        if n_frames < 1:
+            raise DeviceRefused(self.name, f"it cannot be armed for less than one frame ({n_frames})")
+        labels, trigger = self._labels, self._settings.trigger
+        self._await_silence()
+        by_pulse = trigger is TriggerSource.EXTERNAL
+        if labels.train:
+            self._records.set(f"cam1:{labels.train}", n_frames if by_pulse else 1)
+        in_one = trigger is TriggerSource.INTERNAL or (by_pulse and not labels.train)
+        self._records.set("cam1:NumImages", n_frames if in_one else 1)
+        if labels.counted:
+            self._records.set("cam1:ArrayCounter", 0)
+        rows, cols = self.timing.shape
+        with self._changed:
+            self._ring.clear()
+            self._ring_size = max(_LEAST_RING, self._own.ring // (2 * rows * cols))
+            self._lost = self._overrun = 0
+            self._problem, self._origin = None, 1 if labels.counted else None
+            self._armed = True
+        try:
+            if labels.fire or trigger is not TriggerSource.SOFTWARE:
+                self._records.set("cam1:Acquire", 1)
+        except BaseException:
+            self._armed = False
+            raise
+
+    def software_trigger(self) -> None:
+        """Expose one frame. Raises DeviceRefused: it is not armed, or for other triggers."""
+        if not self._armed or self._settings.trigger is not TriggerSource.SOFTWARE:
+            armed = "armed" if self._armed else "not armed"
+            problem = f"it accepts no software trigger ({armed}, trigger {self._settings.trigger})"
+            raise DeviceRefused(self.name, problem, advice="Configure the trigger as software and arm it")
+        if self._labels.fire:
+            self._records.write(f"cam1:{self._labels.fire}", 1)
+        else:
+            self._records.await_value("cam1:Acquire", 0)  # of the frame before
+            self._records.write("cam1:Acquire", 1)
+
+    def next_frame(self, timeout: float) -> CameraFrame:
+        """The oldest frame not yet taken.
+
+        Raises:
+            DeviceTimeout: none came within `timeout` s.
+            DeviceRefused: not armed, or disarmed while waiting.
+            DeviceError: the ring was overrun (later frames can still be taken), frames are of another size or kind than
+                set, or the IOC has gone.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._ring or self._lost or self._problem or not self._armed, timeout)
+            if not self._armed:
+                raise DeviceRefused(self.name, "it is not armed, so no frame will come", advice="arm() it first")
+            lost, self._lost = self._lost, 0
+            if lost:
+                raise DeviceError(
+                    self.name, f"the ring of {self._ring_size} frames was overrun and {lost} frames are lost",
+                    advice="Take frames faster, trigger slower, or raise ring_mb", state="Later frames can be taken",
+                )  # fmt: skip
+            if self._ring:
+                return self._ring.popleft()
+            problem, self._problem = self._problem, None
+            if problem is not None:
+                raise problem
+        raise DeviceTimeout(
+            self.name, f"no frame came within {timeout:g} s of waiting for a trigger ({self._settings.trigger})",
+            advice="Check that triggers arrive, that cam1:ArrayCallbacks and Pva1:EnableCallbacks are Enable, and that "
+            "Pva1:MinCallbackTime is 0", state="It is still armed",
+        )  # fmt: skip
+
+    def disarm(self) -> None:
+        """Stop it and forget frames that were not taken; legal in every state."""
+        if self._closed:
+            return
+        with self._changed:
+            was_armed, self._armed = self._armed, False
+            self._ring.clear()
+            self._changed.notify_all()
+        if was_armed:
+            self._records.set("cam1:Acquire", 0)
+
+    def describe(self) -> dict[str, str | int | float]:
+        """Identity and settings, and the frames that were lost in our ring in the current or last run."""
+        self._require_open()
+        return {
+            "model": str(self._records.read("cam1:Model_RBV")) or "areaDetector",
+            "maker": str(self._records.read("cam1:Manufacturer_RBV")),
+            "driver": self._own.driver,
+            "exposure": self._settings.exposure,
+            "trigger": str(self._settings.trigger),
+            "binning": self._settings.binning,
+            "conversion_factor": self._own.electrons_per_count,
+            "conversion_offset": self._own.offset,
+            "min_period": self.timing.min_period,
+            "row_period": self._own.row_period,
+            "frames_overwritten": self._overrun,
+            "framestamps_begin_anew": "yes" if self._labels.counted else "no",
+        }
+
+    def close(self) -> None:
+        """Stop it and close all connections. A second time does nothing."""
+        if self._closed:
+            return
+        try:
+            self.disarm()
+        finally:
+            self._closed = True
+            self._stream.close()
+            self._collector.join()
+            self._records.close()
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise DeviceError(self.name, "it is closed", advice="Connect again")
+
+    def _refuse_other_sensor(self) -> None:
+        rows, cols = (int(self._records.read(f"cam1:MaxSize{axis}_RBV")) for axis in "YX")
+        if (rows, cols) != tuple(self._own.sensor):
+            raise DeviceRefused(
+                self.name,
+                f"its sensor has {rows} x {cols} pixels, and devices.camera.sensor is {list(self._own.sensor)}",
+                advice="Correct `sensor`, or `prefix` if it is another camera", state="Nothing was set",
+            )  # fmt: skip
+
+    def _applied(self, wanted: CameraSettings) -> CameraSettings:
+        """Write the settings; with the exposure that the camera accepted."""
+        records, labels = self._records, self._labels
+        records.set("cam1:Acquire", 0)
+        row0, col0, height, width = wanted.roi or (0, 0, *self._own.sensor)
+        n = wanted.binning
+        across = n if labels.binned_region else 1
+        for record in ("MinX", "MinY"):  # a larger region fits only from the corner
+            records.write(f"cam1:{record}", 0)
+        binnings = {"A3Binning": labels.binning.format(n)} if labels.binning else {"BinX": n, "BinY": n}
+        region = {"SizeX": width // across, "SizeY": height // across, "MinX": col0 // across, "MinY": row0 // across}
+        for record, value in {**binnings, **region, **labels.triggers[wanted.trigger]}.items():
+            records.set(f"cam1:{record}", value.format(line=self._own.line) if isinstance(value, str) else value)
+        if labels.modes is not None:
+            records.set("cam1:ImageMode", labels.modes[wanted.trigger])
+        exposure = float(records.set("cam1:AcquireTime", wanted.exposure))
+        accepted = replace(wanted, exposure=exposure)
+        if wanted.trigger is TriggerSource.INTERNAL:
+            records.write("cam1:AcquirePeriod", self.timing_of(self._own, accepted).min_period)
+        return accepted
+
+    def _await_silence(self) -> None:
+        """Let frames of an earlier run pass by, which the network may still hold."""
+        silent, seen = self._clock.now(), self._stream_items
+        while self._clock.now() - silent < _SETTLED:
+            self._clock.sleep(_LOOK_EVERY)
+            if self._stream_items != seen:
+                silent, seen = self._clock.now(), self._stream_items
+
+    _stream_items = 0
+
+    def _collect(self) -> None:
+        """Move frames from the stream into the ring, in a thread, until the stream is closed."""
+        while not self._closed:
+            if (item := self._stream.next(_SETTLED)) is None:
+                continue
+            self._stream_items += 1
+            with self._changed:
+                if self._armed:
+                    self._take(item)
+                    self._changed.notify_all()
+
+    def _take(self, item: Item) -> None:
+        if isinstance(item, Overflow):
+            self._lost += 1
+            self._overrun += 1
+        elif isinstance(item, Refused):
+            self._problem = DeviceError(self.name, f"its frames cannot be taken: {item.why}", state="It is still armed")
+        elif isinstance(item, Disconnected):
+            self._problem = DeviceError(
+                self.name, "its IOC has gone", advice="Look whether it runs; it goes on when it is back",
+                state="Frames taken before are good",
+            )  # fmt: skip
+        elif not item.is_current:
+            self._take_frame(item)
+
+    def _take_frame(self, item: ArrayFrame) -> None:
+        shape = self.timing_of(self._own, self._settings).shape
+        if item.window.shape != shape:
+            self._problem = DeviceError(
+                self.name, f"its frames are {item.window.shape[0]} x {item.window.shape[1]} pixels, and {shape[0]} x "
+                f"{shape[1]} were set", advice="Look which plugin Pva1:NDArrayPort names: one that bins or crops may "
+                "stand before it", state="It is still armed",
+            )  # fmt: skip
+            return
+        if self._origin is None:
+            self._origin = item.unique_id
+        at = item.time - self._settings.exposure - self._own.readout
+        try:
+            frame = CameraFrame(item.counts(), item.unique_id - self._origin, at)
+        except ValueError as error:
+            self._problem = DeviceError(self.name, f"a frame is damaged: {error}", state="It is still armed")
+            return
+        if len(self._ring) >= self._ring_size:
+            self._ring.popleft()
+            self._lost += 1
+            self._overrun += 1
+        self._ring.append(frame)

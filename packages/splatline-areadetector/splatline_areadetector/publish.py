@@ -1,0 +1,89 @@
+"""`beamline publish`: the running scan as an areaDetector publishes its frames."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+import click
+
+from beamline.cli.options import say
+
+if TYPE_CHECKING:
+    from splatline_areadetector.publish_detector import PublishedDetector
+    from splatline_areadetector.publish_frames import RunFrames
+    from splatline_areadetector.publish_image import ImageServer
+
+_PREFIX = re.compile(r"[\w.\-:]{0,39}[\w.\-]:")
+_IDLE = 0.005  # s between two looks at the file
+_CLIENTS_EVERY = 1.0  # s
+
+
+def _prefix(ctx: click.Context, param: click.Parameter, value: str) -> str:
+    if not _PREFIX.fullmatch(value):
+        raise click.BadParameter(
+            f"{value!r} is no prefix of EPICS; expected letters, digits, _ . - and a colon at the end, as in 2bma:SPL:."
+        )
+    return value
+
+
+@click.command()
+@click.argument("runs", required=False, default="runs", type=click.Path(path_type=Path, file_okay=False))
+@click.option("--prefix", default="splatline:", show_default=True, callback=_prefix,
+              help="Prefix of the names of the process variables.")  # fmt: skip
+@click.option(
+    "--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Address to listen at; 0.0.0.0: all."
+)
+@click.option("--port", default=None, type=click.IntRange(0, 65535),
+              help="TCP port of the image; by default that of EPICS, or any free one.")  # fmt: skip
+@click.option("--files", default=None, type=click.Path(path_type=Path, file_okay=False, exists=True), metavar="FOLDER",
+              help="Write files that clients ask for, below this folder alone.")  # fmt: skip
+def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | None) -> None:
+    """Publish the frames of the newest run of the folder RUNS (default ./runs) as an EPICS areaDetector does.
+
+    It only reads the run's files, so that it cannot slow a scan down. No client starts, stops or changes the scan.
+    With --files everybody who reaches the address may have frames written below that folder.
+
+    Exit code: 0 ended by Ctrl-C, 2 p4p or softioc is not installed, 5 the address or port cannot be listened at.
+    """
+    from splatline_areadetector.publish_detector import PublishedDetector, records
+    from splatline_areadetector.publish_frames import RunFrames
+    from splatline_areadetector.publish_image import ImageServer
+    from splatline_areadetector.publish_records import RecordServer
+
+    name = f"{prefix}Pva1:Image"
+    with closing(ImageServer(name, bind, port)) as image:
+        detector = PublishedDetector(lambda record, value: put(record, value), files, say)
+        put = RecordServer(prefix, records(name), bind, detector.asked).put
+        with closing(detector), closing(RunFrames(runs, say)) as frames, suppress(KeyboardInterrupt):
+            click.echo(
+                f"{name} at {bind}:{image.port}, {prefix}cam1: and {prefix}HDF1: beside it. Ctrl-C ends this, not the "
+                "scan."
+            )
+            _follow(frames, image, detector, put)
+
+
+def _follow(
+    frames: RunFrames, image: ImageServer, detector: PublishedDetector, put: Callable[[str, int], None]
+) -> NoReturn:
+    """Publish frames as they come, for ever."""
+    run, counted, missed = None, time.monotonic(), 0
+    while True:
+        frame = frames.next()
+        if frames.run != run:
+            run = frames.run
+            detector.began(frames.shape, frames.dtype)
+        if frame is not None:
+            image.post(frame)
+            detector.take(frame)
+        else:
+            time.sleep(_IDLE)
+        if time.monotonic() - counted >= _CLIENTS_EVERY:
+            counted, before = time.monotonic(), missed
+            missed = sum(client.missed for client in image.clients().values())
+            if missed != before:
+                put("Pva1:DroppedArrays_RBV", missed)

@@ -1,0 +1,178 @@
+"""RunFrames: the frames of the newest run of a folder, each once and in order, as they come into its scan file.
+
+They are read from the file, which is written in any case. So no frame of the scan ever waits for whoever looks at them.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.core.errors import ConfigError, DataError
+from beamline.scan.runs import newest
+from beamline.storage.hdf5 import look_again, open_hdf5, readable
+from drivers.base.frame import FrameKind
+
+LOOK_EVERY = 0.5  # s, for a run that began
+_SPREAD = 0.7  # of the mean time between frames: how far apart those that came together are sent
+_WINDOW = 2.0  # s over which that mean is taken
+_LONGEST, _AT_FIRST = 0.25, 0.02  # s that a frame waits after the one before, and while the mean is not known
+
+# Paths of docs/file_layout.md.
+_DATA, _KIND = "/entry/instrument/detector/data", "/entry/frame_log/kind"
+_ANGLE, _TIME = "/entry/sample/rotation_angle", "/entry/frame_log/time"
+_EXPOSURE, _COMMITTED = "/entry/instrument/detector/count_time", "/entry/progress/frames_committed"
+_COLUMNS = (_DATA, _KIND, _ANGLE, _TIME, _EXPOSURE)
+
+
+@dataclass(frozen=True, eq=False)
+class PublishedFrame:
+    """A frame of a scan, as control systems see it.
+
+    Attributes:
+        counts: [row, col].
+        unique_id: its row in the scan file, counted from 1; a run begins anew at 1.
+        angle: deg, of the stage at the trigger, as the scan file has it; NaN: unknown.
+        time: s since the Unix epoch, at the trigger.
+        exposure: s.
+    """
+
+    counts: NDArray[Any]
+    unique_id: int
+    kind: FrameKind
+    angle: float
+    time: float
+    exposure: float
+
+
+class Pace:
+    """Spreads frames that came into the file together, as the queue of a client holds four of them by default."""
+
+    def __init__(self) -> None:
+        self._came, self._sent = deque[tuple[float, int]](), -math.inf  # times and frames
+
+    def came(self, n: int, now: float) -> None:
+        """n frames came into the file by this time (s)."""
+        self._came.append((now, n))
+        while self._came[0][0] < now - _WINDOW:
+            self._came.popleft()
+
+    def wait(self, now: float) -> float:
+        """s for which the next frame is still to wait."""
+        n = sum(n for _, n in self._came) - self._came[0][1] if self._came else 0
+        apart = _SPREAD * (now - self._came[0][0]) / n if n else _AT_FIRST
+        return max(0.0, self._sent + min(apart, _LONGEST) - now)
+
+    def sent(self, now: float) -> None:
+        """A frame was sent at this time (s)."""
+        self._sent = now
+
+
+class RunFrames:
+    """The frames of the newest run of a folder, from now on, and of each run that begins later.
+
+    Of the run that is there at the start, the newest frame comes first. Calls come from one thread.
+
+    Args:
+        say: takes a sentence about a file that cannot be read.
+        now: a clock, s.
+
+    Attributes:
+        run: folder of the (part of the) run whose frames come; None: there is none yet.
+        shape: rows and columns of its frames; (0, 0) before.
+        dtype: of their pixels.
+    """
+
+    def __init__(self, runs: Path, say: Callable[[str], None], now: Callable[[], float] = time.monotonic) -> None:
+        self._runs, self._say, self._now = runs, say, now
+        self.run: Path | None = None
+        self.shape, self.dtype = (0, 0), np.dtype(np.uint16)
+        self._file: Any = None
+        self._columns: list[Any] = []  # stay open: HDF5 refreshes wrongly what is open twice
+        self._counter: Any = None
+        self._pace, self._looked = Pace(), -math.inf
+        self._next = self._committed = 0
+        self._look()
+        if self._file is not None:
+            self._next = max(0, self._n_committed() - 1)
+
+    @property
+    def waiting(self) -> int:
+        """Frames in the file that have not come yet."""
+        return self._committed - self._next
+
+    def next(self) -> PublishedFrame | None:
+        """The next frame that is due; None: there is none yet."""
+        now = self._now()
+        if now - self._looked >= LOOK_EVERY and not self.waiting:
+            self._look()
+        if self._file is None or self.run is None:
+            return None
+        try:
+            with readable(self.run):
+                if (committed := self._n_committed()) > self._committed:
+                    self._pace.came(committed - self._committed, now)
+                    self._committed = committed
+                if not self.waiting or self._pace.wait(now):
+                    return None
+                frame = self._read(self._next)
+        except DataError as error:
+            self._say(f"No more frames of this run are published: {error}")
+            self.close()
+            return None
+        self._next += 1
+        self._pace.sent(now)
+        return frame
+
+    def close(self) -> None:
+        """Close the file. A second time does nothing."""
+        file, self._file = self._file, None
+        if file is not None:
+            with suppress(OSError, RuntimeError, ValueError):
+                file.close()
+        self._committed = self._next
+
+    def _look(self) -> None:
+        """Open the file of the newest run, if it is another one."""
+        self._looked = self._now()
+        with suppress(ConfigError, DataError):  # no run, or a file that is just being made
+            run = _newest_part(newest(self._runs))
+            if run == self.run:
+                return
+            file = open_hdf5(run / "scan.h5", follow=True)
+            with ExitStack() as failed:
+                failed.callback(file.close)
+                with readable(run):
+                    columns, counter = [file[path] for path in _COLUMNS], file[_COMMITTED]
+                failed.pop_all()
+            self.close()
+            self._file, self.run, self._columns, self._counter = file, run, columns, counter
+            self.shape, self.dtype = columns[0].shape[1:], columns[0].dtype
+            self._next = self._committed = 0
+
+    def _n_committed(self) -> int:
+        look_again(self._counter)
+        return int(self._counter[()])
+
+    def _read(self, row: int) -> PublishedFrame:
+        for column in self._columns:
+            if len(column) <= row:
+                look_again(column)
+        counts, kind, angle, at, exposure = (column[row] for column in self._columns)
+        return PublishedFrame(counts, row + 1, FrameKind(int(kind)), float(angle), float(at), float(exposure))
+
+
+def _newest_part(run: Path) -> Path:
+    """The folder of the newest part of a run that was resumed, else of the run."""
+    numbers = [int(match[1]) for part in run.glob("part-*") if (match := re.fullmatch(r"part-(\d+)", part.name))]
+    return run / f"part-{max(numbers)}" if numbers else run
