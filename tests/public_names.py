@@ -46,7 +46,7 @@ FOR_PACKAGES = {
     "beamline.config.load": ("load_as", "resolved_yaml"),
     "beamline.config.models": (
         "Degrees", "Fields", "OpticsSection", "ReconSection", "SampleSection", "Seconds", "StorageSection", "Views",
-        "WishSection",
+        "TargetSection",
     ),
     "beamline.config.monitor": ("MonitorSection", "ReferencesSection"),
     "beamline.config.section": ("Section", "section_of"),

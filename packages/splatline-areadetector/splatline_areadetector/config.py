@@ -16,8 +16,8 @@ from beamline.config.models import (
     SampleSection,
     Seconds,
     StorageSection,
+    TargetSection,
     Views,
-    WishSection,
 )
 from beamline.config.monitor import MonitorSection, ReferencesSection
 from beamline.config.section import Section, section_of
@@ -118,7 +118,7 @@ class _Scan(Section):
     """What an own scan asks of its plan, and a ridden one does not."""
 
     decide: Literal["off"] = "off"
-    wish: WishSection = WishSection()
+    target: TargetSection = TargetSection()
     wait_s: float = 0.0
 
 

@@ -15,7 +15,7 @@ from splatline_areadetector.publish_image import attributes_of
 
 ATTRIBUTES = {
     "Angle": ("DOUBLE", "f8", "deg, of the stage at the trigger"),
-    "Kind": ("STRING", "S40", "projection, flat, dark, alignment, wide_view or invalid"),
+    "Kind": ("STRING", "S40", "projection, flat, dark, alignment, offset_view or invalid"),
     "HDF5FrameLocation": ("STRING", "S40", "where tomoscan stores frames of this kind"),
     "AcquireTime": ("DOUBLE", "f8", "s, exposure"),
 }
