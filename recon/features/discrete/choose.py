@@ -92,7 +92,8 @@ class MaterialTrial:
         if not where.any() or self._trial.ended:
             return none
         levels, weights = (
-            fitted_levels(self._start[where], count) if self._levels is None
+            fitted_levels(self._start[where], count)
+            if self._levels is None
             else (np.array(self._levels), np.full(count, 1 / count))
         )
         if not np.diff(levels).min() > 0:

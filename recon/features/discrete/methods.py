@@ -1,4 +1,4 @@
-"""Discrete tomography with partial voxels: total variation, then a pull to a few materials where these predict views."""
+"""Discrete tomography with partial voxels: total variation, then a pull to few materials where these predict views."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import FistaTv
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
+from recon.voxels.projector import volume_lines
 from recon.voxels.trial import SUBSETS, TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem, density_unit
 
-MATERIALS, UNDECIDED = "materials", "undecided_share"
-"""Names of the decisions on the materials, in the units of the scan, and on the share of voxels of no certain one."""
+MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
+"""Names of the decisions on the materials, in the units of the scan, and on the share of voxels that are more likely
+partial than of one material; and how settings end that state the materials."""
 _MODELS = 9  # trials of materials, as a rule
 
 
@@ -83,7 +85,7 @@ class Discrete(VoxelMethod):
         first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
         x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
         density = problem.units.density
-        kept = problem.decide(MATERIALS, lambda: self._materials(problem, weight, trial()).scaled(density))
+        kept = problem.decide(MATERIALS, lambda: [*self._materials(problem, weight, trial()).scaled(density)])
         materials = MaterialPrior(*kept).scaled(-density)
         if not (materials.levels and first.going):
             return x
@@ -108,7 +110,7 @@ class Discrete(VoxelMethod):
         decide = control.decide or Decisions(problem.seed)
         result = super().run(problem, replace(control, decide=decide))
         materials = MaterialPrior(*decide.made.get(MATERIALS, [()])[-1])
-        found = {f"{name}_of_materials": value for name, value in materials._asdict().items()}
+        found = {name + _OF: value for name, value in materials._asdict().items()}
         share = {UNDECIDED: decide.made[UNDECIDED][-1]} if UNDECIDED in decide.made else {}
         return replace(result, settings={**result.settings, **(found if materials.levels else {}), **share})
 
@@ -128,3 +130,18 @@ class Discrete(VoxelMethod):
         found = MaterialTrial(trial, weight, self.iterations, levels)
         found.choose()
         return found
+
+
+def probabilities_of(result: Reconstruction) -> F32:
+    """[material, z, y, x] probability that a voxel of a volume of `Discrete` is of one material, in ascending order.
+
+    What is missing to 1 is that of a partial voxel. Air around the sample is taken as matter, too.
+
+    Raises:
+        ValueError: the volume was not pulled to few materials.
+    """
+    given = [result.settings.get(name + _OF) for name in MaterialPrior._fields]
+    if not given[0]:
+        raise ValueError("the volume has no materials: views held out did not prefer them; nothing was computed")
+    found = probabilities(volume_lines(result.volume.data), MaterialPrior(*given))
+    return np.ascontiguousarray(found.transpose(0, 3, 1, 2))

@@ -21,7 +21,7 @@ from recon.base.arrays import F32, F64, some_values
 from recon.base.decisions import MaterialPrior
 from recon.kernels.cpu.materials import MaterialTable, posterior_mean
 
-NOISE, MOST_NOISE, SPREAD = 0.09, 0.2, 0.06
+NOISE, MOST_NOISE, SPREAD = 0.08, 0.2, 0.06
 """Noise and spread of a voxel over the gap of levels. A noise of 0.2 suits few views (+0.3 dB at 45 of 256 columns); at
 90 views it takes cracks of half a voxel to one voxel from 0.63 to 0.53 of their depth (FISTA-TV: 0.66)."""
 PARTIAL = (0.5, 0.9)
@@ -57,14 +57,20 @@ def fitted_levels(values: F32, count: int) -> tuple[F64, F64]:
     return mean[order], weight[:count][order] / weight[:count].sum()
 
 
+def noise_and_spread(materials: MaterialPrior) -> tuple[float, float]:
+    """Standard deviations of a voxel's error, and of a material's density.
+
+    Fewer views leave more error, and the less total variation predicts them best.
+    """
+    gap = float(np.exp(np.log(np.diff(materials.levels)).mean()))
+    return min(MOST_NOISE, NOISE / math.sqrt(materials.tv_share)) * gap, SPREAD * gap
+
+
 def table_of(materials: MaterialPrior) -> MaterialTable:
     """What the kernel knows of these materials."""
     m, weight = np.array(materials.levels), np.array(materials.weights)
-    gaps = np.diff(m)
-    unit = float(np.exp(np.log(gaps).mean()))
-    # Fewer views leave more error, and the less total variation predicts them best.
-    noise = min(MOST_NOISE, NOISE / math.sqrt(materials.tv_share)) * unit
-    variance = noise**2 + (SPREAD * unit) ** 2
+    gaps, (noise, spread) = np.diff(m), noise_and_spread(materials)
+    variance = noise**2 + spread**2
     beyond = _REACH * math.sqrt(variance)
     values = np.linspace(m[0] - beyond, m[-1] + beyond, _ROWS)
     likelihoods = np.exp(-0.5 * (values[:, None] - m) ** 2 / variance) / math.sqrt(2 * math.pi * variance)
@@ -74,7 +80,7 @@ def table_of(materials: MaterialPrior) -> MaterialTable:
     shares = own / whole
     shares[:, :-1] += part / whole * (1 - up)
     shares[:, 1:] += part / whole * up
-    kept = np.full(m.size, (SPREAD * unit) ** 2 / variance, np.float32)
+    kept = np.full(m.size, spread**2 / variance, np.float32)
     step = float(values[1] - values[0])
     singles = (each.astype(np.float32) for each in (shares, likelihoods, m))
     return MaterialTable(*singles, kept, (1 / gaps).astype(np.float32), float(values[0]), 1 / step, *PARTIAL)
