@@ -18,14 +18,12 @@ class MaterialPrior(NamedTuple):
         weights: shares of the materials in the sample.
         tv_share: of the weight of total variation that remains.
         pull: c of the step c (z - x), where a step of the views is one.
-        inside: voxels in the air around the sample are not pulled.
     """
 
     levels: tuple[float, ...] = ()
     weights: tuple[float, ...] = ()
     tv_share: float = 1.0
     pull: float = 0.0
-    inside: bool = True
 
     def scaled(self, power: int) -> MaterialPrior:
         """The same in units in which densities are 2^power times as large."""

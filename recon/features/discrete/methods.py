@@ -14,8 +14,8 @@ from recon.base.decisions import Decisions, GoesOn, MaterialPrior, Prior
 from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.method import Plain, ReconProblem, Reconstruction, RunControl
 from recon.base.setting import Count
-from recon.features.discrete.choose import PULLS, MaterialTrial, within
-from recon.features.discrete.mixture import AIR, MaterialPull, probabilities
+from recon.features.discrete.choose import PULLS, MaterialTrial, in_field
+from recon.features.discrete.mixture import MaterialPull, probabilities
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
@@ -23,12 +23,12 @@ from recon.voxels.methods import FistaTv
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
 from recon.voxels.projector import volume_lines
 from recon.voxels.trial import SUBSETS, TV_STEPS, Trial
-from recon.voxels.voxel_problem import Buffers, VoxelProblem, density_unit
+from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
 MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
 """Names of the decisions on the materials, in the units of the scan, and on the share of voxels that are more likely
 partial than of one material; and how settings end that state the materials."""
-_MODELS = 9  # trials of materials, as a rule
+_TRIALS = 6  # trials of materials, as a rule
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Discrete(VoxelMethod):
     @property
     def trial_sweeps(self) -> int:
         """Sweeps for the weight of total variation, and with materials."""
-        return CHOICE_SWEEPS + _MODELS * self.iterations
+        return CHOICE_SWEEPS + _TRIALS * self.iterations
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
@@ -89,8 +89,7 @@ class Discrete(VoxelMethod):
         materials = MaterialPrior(*kept).scaled(-density)
         if not (materials.levels and first.going):
             return x
-        air = problem.decide("air", lambda: AIR * density_unit(x))
-        where = within(problem, x, materials.inside, air)
+        where = in_field(problem)
         further = replace(problem, go_on=lambda sweep, left: problem.go_on(self.first_sweeps + sweep, left))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
         subsets = Subsets.of(problem, SUBSETS, FEWEST_SUBSETS)
@@ -121,7 +120,7 @@ class Discrete(VoxelMethod):
         if trial is None or isinstance(weight, NoiseBalance):
             levels = self.levels or ()
             weights = tuple(1 / len(levels) for _ in levels)
-            return MaterialPrior(levels, weights, 1.0, PULLS[-1], False).scaled(-problem.units.density)
+            return MaterialPrior(levels, weights, 1.0, PULLS[-1]).scaled(-problem.units.density)
         return self._choice(trial, weight).materials
 
     def _choice(self, trial: Trial, weight: float) -> MaterialTrial:
@@ -135,7 +134,7 @@ class Discrete(VoxelMethod):
 def probabilities_of(result: Reconstruction) -> F32:
     """[material, z, y, x] probability that a voxel of a volume of `Discrete` is of one material, in ascending order.
 
-    What is missing to 1 is that of a partial voxel. Air around the sample is taken as matter, too.
+    What is missing to 1 is that of a partial voxel.
 
     Raises:
         ValueError: the volume was not pulled to few materials.

@@ -15,7 +15,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 
 from recon.base.arrays import F32, F64, some_values
 from recon.base.decisions import MaterialPrior
@@ -26,7 +25,6 @@ NOISE, MOST_NOISE, SPREAD = 0.08, 0.2, 0.06
 90 views it takes cracks of half a voxel to one voxel from 0.63 to 0.53 of their depth (FISTA-TV: 0.66)."""
 PARTIAL = (0.5, 0.9)
 """Probabilities of a partial voxel, within a material and where two meet."""
-AIR, ERODED, _SMOOTH = 0.1, 3.0, 2.0  # of the density unit; voxels; voxels
 _ROWS, _REACH = 4096, 6.0  # of the tables, and standard deviations beyond the outer levels
 _BINS, _ROUNDS, _LOOKED_AT = 400, 60, 300_007
 
@@ -84,20 +82,6 @@ def table_of(materials: MaterialPrior) -> MaterialTable:
     step = float(values[1] - values[0])
     singles = (each.astype(np.float32) for each in (shares, likelihoods, m))
     return MaterialTable(*singles, kept, (1 / gaps).astype(np.float32), float(values[0]), 1 / step, *PARTIAL)
-
-
-def interior(x: F32, air: float) -> np.ndarray:
-    """[y, x, z] voxels within the sample: in each slice those that air from its edges does not reach, but for a rim.
-
-    Args:
-        air: density below which smoothed voxels count as air.
-    """
-    within = np.empty(x.shape, bool)
-    for k in range(x.shape[2]):
-        low = np.pad(ndimage.gaussian_filter(x[:, :, k], _SMOOTH) < air, 1, constant_values=True)
-        parts, _ = ndimage.label(low)
-        within[:, :, k] = ndimage.distance_transform_edt(parts != parts[0, 0])[1:-1, 1:-1] > ERODED
-    return within
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from recon.voxels.methods import PnpDct
 from recon.voxels.projector import Projector
 
 F32 = NDArray[np.float32]
-VIEWS = recon.Geometry.parallel(np.arange(24) * np.pi / 24, (6, 64))
+VIEWS = recon.Geometry.parallel(np.arange(20) * np.pi / 20, (6, 64))
 GRID = recon.Grid.matching(VIEWS)
 
 
@@ -25,8 +25,8 @@ def grains() -> F32:
     """Balls of 0.05 in a can of 0.015, with partial voxels at their faces."""
     rng, (z, y, x) = np.random.default_rng(2), np.meshgrid(*GRID.coordinates(), indexing="ij")
     truth = 0.015 * np.clip(28.5 - np.hypot(x, y), 0, 1)
-    for _ in range(60):
-        (r, turn, height), away = rng.uniform((4, 0, -6), (7, 2 * np.pi, 6)), 20 * math.sqrt(rng.uniform())
+    for _ in range(300):
+        (r, turn, height), away = rng.uniform((2, 0, -5), (3.5, 2 * np.pi, 5)), 24 * math.sqrt(rng.uniform())
         far = np.sqrt((x - away * np.cos(turn)) ** 2 + (y - away * np.sin(turn)) ** 2 + (z - height) ** 2)
         truth = np.maximum(truth, 0.015 + 0.035 * np.clip(r + 0.5 - far, 0, 1))
     return truth.astype(np.float32)
@@ -56,10 +56,10 @@ def error(volume: F32, truth: F32) -> float:
 @pytest.mark.slow
 def test_grains_of_two_materials_are_nearer_to_the_truth(of_grains: recon.Reconstruction) -> None:
     tv = recon.reconstruct(measured(grains()), VIEWS, recon.FistaTv()).volume.data
-    assert error(of_grains.volume.data, grains()) < 0.85 * error(tv, grains())
+    assert error(of_grains.volume.data, grains()) < 0.9 * error(tv, grains())
     levels = of_grains.settings["levels_of_materials"]
     assert len(levels) == 2
-    np.testing.assert_allclose(levels, (0.015, 0.05), atol=0.003)
+    np.testing.assert_allclose(levels, (0.015, 0.05), atol=0.002)
     assert 0 < of_grains.settings[UNDECIDED] < 1
 
 

@@ -12,7 +12,6 @@ from recon.base.decisions import MaterialPrior
 from recon.features.discrete.mixture import (
     MaterialPull,
     fitted_levels,
-    interior,
     noise_and_spread,
     probabilities,
     table_of,
@@ -111,12 +110,3 @@ def test_levels_are_found_among_partial_voxels(levels: tuple[float, ...]) -> Non
     found, weights = fitted_levels(values.astype(np.float32), len(levels))
     np.testing.assert_allclose(found, levels, atol=0.01)
     assert weights.sum() == pytest.approx(1) and weights.min() > 0.25
-
-
-def test_the_interior_leaves_out_the_air_around_a_sample_and_keeps_its_pores() -> None:
-    a = np.arange(64) - 31.5
-    away = np.hypot(a[:, None], a)
-    x = np.where(away < 24, np.float32(1), np.float32(0))
-    x[np.hypot(a[:, None] - 4, a) < 5] = 0
-    within = interior(np.repeat(x[:, :, None], 2, axis=2), 0.1)
-    assert within[:, :, 0][away < 18].all() and not within[:, :, 1][away > 24].any()
