@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -89,7 +89,9 @@ class Discrete(VoxelMethod):
         first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
         x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
         density = problem.units.density
-        kept = problem.decide(MATERIALS, lambda: [*self._materials(problem, weight, trial()).scaled(density)])
+        kept: list[Any] = problem.decide(
+            MATERIALS, lambda: [*self._materials(problem, weight, trial()).scaled(density)]
+        )
         materials = MaterialPrior(*kept).scaled(-density)
         if not (materials.levels and first.going):
             return x
@@ -143,7 +145,7 @@ def probabilities_of(result: Reconstruction) -> F32:
     Raises:
         ValueError: the volume was not pulled to few materials.
     """
-    given = [result.settings.get(name + _OF) for name in MaterialPrior._fields]
+    given: list[Any] = [result.settings.get(name + _OF) for name in MaterialPrior._fields]
     if not given[0]:
         raise ValueError("the volume has no materials: views held out did not prefer them; nothing was computed")
     found = probabilities(volume_lines(result.volume.data), MaterialPrior(*given))

@@ -101,7 +101,7 @@ def test_probabilities_leave_the_rest_to_partial_voxels() -> None:
     assert p[0, 1].min() > 0.5 and p[1, 10].min() > 0.5 and p[:, 5].sum(0).max() < 0.1
 
 
-@pytest.mark.parametrize("levels", [(0.2, 1.0), (0.0, 0.4, 1.0)])
+@pytest.mark.parametrize("levels", [(0.2, 1.0), (0.15, 0.5, 1.0)])
 def test_levels_are_found_among_partial_voxels(levels: tuple[float, ...]) -> None:
     rng = np.random.default_rng(0)
     pure = rng.choice(levels, 30_000, p=np.full(len(levels), 1 / len(levels)))
@@ -110,3 +110,10 @@ def test_levels_are_found_among_partial_voxels(levels: tuple[float, ...]) -> Non
     found, weights = fitted_levels(values.astype(np.float32), len(levels))
     np.testing.assert_allclose(found, levels, atol=0.01)
     assert weights.sum() == pytest.approx(1) and weights.min() > 0.25
+
+
+def test_air_around_a_sample_draws_no_level_down() -> None:
+    rng = np.random.default_rng(0)
+    matter = rng.choice((0.25, 1.0), 30_000) + rng.normal(0, 0.05, 30_000)
+    values = np.concatenate((matter, np.abs(rng.normal(0, 1e-3, 10_000)))).astype(np.float32)
+    np.testing.assert_allclose(fitted_levels(values, 2)[0], (0.25, 1.0), atol=0.01)
