@@ -52,6 +52,7 @@ from tests.bench.quality_cases import Case, rows_of
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+Depths = tuple[float | None, float | None, float | None]
 VERSION = 2
 """Of scenes and figures: scores of another one do not belong into the same table."""
 BESIDE, ACROSS, POINTS, FEWEST = 2.5, 0.6, 60, 15
@@ -90,7 +91,7 @@ class Score(NamedTuple):
     memory: float
 
 
-def crack_depths(volume: F32, truth: F32, planes: Planes) -> list[float | None]:
+def crack_depths(volume: F32, truth: F32, planes: Planes) -> Depths:
     """Depth of cracks over the true one, by width as `WIDTHS`; None: there is no crack so wide.
 
     The depth is the mean of a disc in the crack below that of two discs `BESIDE` voxels beside it, all within the same
@@ -118,10 +119,11 @@ def crack_depths(volume: F32, truth: F32, planes: Planes) -> list[float | None]:
 
     made, true, some = depth(volume), depth(truth), counts.sum(1) >= FEWEST
     wide = [some & (low <= planes.width) & (planes.width < high) for low, high in pairwise(WIDTHS)]
-    return [float(made[each].sum() / true[each].sum()) if each.any() else None for each in wide]
+    thin, medium, thick = (float(made[each].sum() / true[each].sum()) if each.any() else None for each in wide)
+    return thin, medium, thick
 
 
-def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float | None, ...]:
+def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float, float, *Depths]:
     """dB, fraction of grains over the true one, and depths of cracks by width (all rows of such a scene only)."""
     volume, truth = np.maximum(volume, 0), scene.truth[list(rows)]
     x = np.arange(truth.shape[2]) - (truth.shape[2] - 1) / 2
@@ -130,7 +132,7 @@ def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float | None
     inside, half_way = away < min(field, scene.inner - 2), sum(scene.levels) / 2
     fraction = np.mean(volume[:, inside] > half_way) / np.mean(truth[:, inside] > half_way)
     whole = scene.planes is not None and len(rows) == len(scene.truth)
-    depths = crack_depths(volume, truth, scene.planes) if whole and scene.planes else [None] * (len(WIDTHS) - 1)
+    depths = crack_depths(volume, truth, scene.planes) if whole and scene.planes else (None, None, None)
     quality = 10 * math.log10(float(scene.truth.max()) ** 2 / error)
     return quality, float(fraction), *depths
 
