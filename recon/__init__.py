@@ -29,6 +29,7 @@ os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 if TYPE_CHECKING:
     from recon.auto import Auto
     from recon.axis_held_out import axis_by_views
+    from recon.features.discrete.methods import Discrete
     from recon.features.iterative.methods import AsdPocs, Cgls, Sart, Sirt
     from recon.features.joint.energy_fit import EnergyViews
     from recon.features.joint.learnt_motion import register_energies
@@ -63,6 +64,7 @@ __all__ = [
     "CorrectionSettings",
     "Counts",
     "DataUse",
+    "Discrete",
     "EnergyViews",
     "Fbp",
     "FistaTv",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args
 
@@ -32,6 +33,18 @@ def checkpoint_input(ctx: click.Context, param: click.Parameter, path: Path | No
     if path is not None and not path.exists():
         raise DataError(f"--{param.name} {path} does not exist. Nothing was changed.")
     return path
+
+
+def levels_of(given: str | Sequence[float]) -> tuple[float, ...]:
+    """Densities from text such as "0.1,0.5", or from a recipe's list. Raises ValueError for others."""
+    parts = given.split(",") if isinstance(given, str) else given
+    try:
+        levels = tuple(float(part) for part in parts)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{given!r} are no densities; expected numbers such as 0.1,0.5") from error
+    if len(levels) < 2 or any(not low < high for low, high in pairwise(levels)):
+        raise ValueError(f"{given!r}: expected two or more densities, each above the one before")
+    return levels
 
 
 def settings_of(command: click.Command, values: dict[str, Any]) -> dict[str, Any]:
@@ -191,6 +204,14 @@ _PATCH_THRESHOLD = option(
     help="Cosine coefficients of patches up to this threshold are set to 0, relative to the density of the sample. "
     "Default: chosen by held-out views.",
 )
+_LEVELS = option(
+    "--levels",
+    setting="levels",
+    callback=parsed(levels_of),
+    metavar="A,B,...",
+    help="Densities of the sample's materials in 1/mm, ascending, for discrete. Default: two to four levels, as "
+    "held-out views prefer.",
+)
 _ALLOW_NEGATIVE = option(
     "--allow-negative",
     setting="allow_negative",
@@ -324,6 +345,7 @@ method_options = together(
     _ITERATIONS,
     _TV_WEIGHT,
     _PATCH_THRESHOLD,
+    _LEVELS,
     _ALLOW_NEGATIVE,
     _IN_TIME,
     option(

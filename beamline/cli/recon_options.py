@@ -91,7 +91,7 @@ recon_options = together(
         "-m",
         "--method",
         type=MethodChoice((AUTO, *names())),
-        help="auto chooses fbp, fista-tv, pnp-dct or r2 by held-out views. r2 fits Gaussians to the views, "
+        help="auto chooses fbp, fista-tv, discrete, pnp-dct or r2 by held-out views. r2 fits Gaussians to the views, "
         "fbp is filtered back-projection, the others iterate on voxels; "
         f"{_FOR_COMPARISON} are there for comparison. Default: auto; r2 with --follow and with options of the fit.",
     ),

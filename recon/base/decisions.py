@@ -10,6 +10,26 @@ from typing import Any, NamedTuple, Self, TypeVar
 T = TypeVar("T")
 
 
+class MaterialPrior(NamedTuple):
+    """Few materials that voxels are pulled to, and how.
+
+    Attributes:
+        levels: densities of the materials, ascending; none: voxels are not pulled.
+        weights: shares of the materials in the sample.
+        tv_share: of the weight of total variation that remains.
+        pull: c of the step c (z - x), where a step of the views is one.
+    """
+
+    levels: tuple[float, ...] = ()
+    weights: tuple[float, ...] = ()
+    tv_share: float = 1.0
+    pull: float = 0.0
+
+    def scaled(self, power: int) -> MaterialPrior:
+        """The same in units in which densities are 2^power times as large."""
+        return self._replace(levels=tuple(math.ldexp(level, power) for level in self.levels))
+
+
 class Prior(NamedTuple):
     """The prior of a volume.
 
@@ -17,11 +37,19 @@ class Prior(NamedTuple):
         weight: of total variation, μ of min ½||A x - p||² + μ TV(x).
         strength: last threshold of sparse patches; 0: it was not sought.
         patches: these predict views held out better than total variation alone.
+        materials: that voxels are pulled to; None: they were not sought.
     """
 
     weight: float
     strength: float = 0.0
     patches: bool = False
+    materials: MaterialPrior | None = None
+
+    @classmethod
+    def of(cls, values: Sequence[Any]) -> Prior:
+        """A prior, or its values from a file."""
+        weight, strength, patches, materials = values
+        return cls(weight, strength, patches, materials and MaterialPrior(*materials))
 
 
 class Decisions:

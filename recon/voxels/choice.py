@@ -79,7 +79,7 @@ class TrialChoice(NamedTuple):
     def of(cls, values: Sequence[Any]) -> TrialChoice:
         """A choice, or its values from a file, as `Decisions` keeps it."""
         where, least_gain, predictions = values
-        named = ((name, left, prior and Prior(*prior), remark) for name, left, prior, remark in predictions)
+        named = ((name, left, prior and Prior.of(prior), remark) for name, left, prior, remark in predictions)
         return cls(where, least_gain, tuple(Prediction(*each) for each in named))
 
     def after(self, prediction: Prediction) -> TrialChoice:

@@ -205,10 +205,13 @@ class PnpDct(VoxelMethod):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction with the best threshold; with one of its own that of the method's volume.
 
-        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.prior`.
+        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.prior`; nor where few
+        materials predict the views better than total variation, to save the time.
         """
-        if self.patch_threshold is None and trial.settings.wide and so_far.tried:
-            return Prediction(self.name, remark=f"{self.name} not tried of a sample wider than the field")
+        few = any(each.prior and each.prior.materials and each.prior.materials.levels for each in so_far.predictions)
+        if self.patch_threshold is None and so_far.tried and (few or trial.settings.wide):
+            where = "few materials predict the views" if few else "the sample is wider than the field"
+            return Prediction(self.name, remark=f"{self.name} not tried, as {where}")
         if self.patch_threshold is not None or trial.prior is None or not trial.prior.strength:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)

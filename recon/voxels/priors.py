@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,9 +152,28 @@ class Subsets:
         return cls(views, projectors, step, norm)
 
 
+RENEWED = 2
+"""Sweeps after which the volume is made anew towards which steps are pulled."""
+
+
+class Pull(Protocol):
+    """A volume z that follows x, towards which each step of `ordered_fista` moves a share of the way.
+
+    Attributes:
+        share: c of c (z - x).
+    """
+
+    @property
+    def share(self) -> float: ...
+
+    def target(self, x: F32) -> F32:
+        """z [y, x, z] for a volume x, which is not changed."""
+
+
 def ordered_fista(
-    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int
-) -> F32:
+    problem: VoxelProblem, x: F32, weight: NoiseBalance | float, subsets: Subsets, *, sweeps: int, tv_steps: int,
+    pull: Pull | None = None,
+) -> F32:  # fmt: skip
     """min ½||A x - p||² + μ TV(x), x >= 0, by steps from a subset of the views each, with momentum and restarts.
 
         x <- prox_{μ/L TV}(y + (m / L) A_sᵀ W (p_s - A_s y)),    L >= the largest eigenvalue of AᵀWA, m subsets
@@ -167,6 +186,7 @@ def ordered_fista(
         x: [y, x, z], not zero; overwritten.
         weight: μ, or an object that chooses it after each sweep.
         tv_steps: dual steps of each proximal step, which continue from the last ones.
+        pull: adds c (z - x) to each step, so that β/2 |x - z|² with β = c L is minimised, too.
     """
     device, step, count = voxel_device(problem.projector.device), subsets.step, len(subsets.views)
     prox = TotalVariationProx(
@@ -178,6 +198,8 @@ def ordered_fista(
     gradient, ahead = device.copy(x), Momentum(x, problem.decide, device)
     for k in range(sweeps):
         error, seen = 0.0, []
+        if pull is not None and k % RENEWED == 0:
+            target = device.array(pull.target(device.numpy(x)))
         for at, s in enumerate(problem.rng.permutation(count)):
             part = slice(None) if count == 1 else subsets.views[s]
             data, rays = views[part], None if weights is None else weights[part]
@@ -191,7 +213,9 @@ def ordered_fista(
             if rays is not None:
                 residual *= rays
             projectors[s].adjoint_lines(residual, gradient)
-            device.combine(1.0, x, step, gradient, x)
+            device.combine(1.0 if pull is None else 1.0 - pull.share, x, step, gradient, x)
+            if pull is not None:
+                device.combine(1.0, x, pull.share, target, x)
             prox(x, mu * step / count)
             prox.turn()
             if at + 1 < count:

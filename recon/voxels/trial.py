@@ -26,7 +26,7 @@ from recon.base.volume import Grid, Volume
 from recon.voxels.choice import LEAST_GAIN, BestStrength, Prediction, TrialChoice, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, TRIAL_SWEEPS
-from recon.voxels.priors import NoiseBalance, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
+from recon.voxels.priors import NoiseBalance, Pull, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
 from recon.voxels.projector import volume_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.voxel_problem import VoxelProblem, times_power
@@ -351,11 +351,13 @@ class Trial:
         """Residuals for patches of this strength; None: it was not tried."""
         return self._known.get(("patches", strength))
 
-    def volume_of_weight(self, weight: float) -> F32:
-        """The volume of total variation with this weight."""
+    def volume_of_weight(
+        self, weight: float, start: F32 | None = None, sweeps: int = TRIAL_SWEEPS, pull: Pull | None = None
+    ) -> F32:
+        """The volume of total variation with this weight, `start` and `pull` as of `volume_by` and `ordered_fista`."""
         return self.volume_by(lambda part, x: ordered_fista(
-            part, x, weight, self._subsets, sweeps=TRIAL_SWEEPS, tv_steps=TV_STEPS
-        ))  # fmt: skip
+            part, x, weight, self._subsets, sweeps=sweeps, tv_steps=TV_STEPS, pull=pull
+        ), start)  # fmt: skip
 
     def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
         """The volume that `make` computes from a copy of the first one; that copy once the trials ended."""

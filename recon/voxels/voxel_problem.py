@@ -141,7 +141,10 @@ class Units(NamedTuple):
     def prior(self, prior: Prior, weighed: bool, sign: int = -1) -> Prior:
         """The prior in these units, of rays that are `weighed` or not; with a sign of 1 back in those of the scan."""
         weight = math.ldexp(prior.weight, sign * (self.length + self.integral + weighed * self.weight))
-        return prior._replace(weight=weight, strength=math.ldexp(prior.strength, sign * self.density))
+        materials = prior.materials and prior.materials.scaled(sign * self.density)
+        return prior._replace(
+            weight=weight, strength=math.ldexp(prior.strength, sign * self.density), materials=materials
+        )
 
 
 _NO_UNITS = Units()

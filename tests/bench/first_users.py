@@ -9,9 +9,10 @@ pixel in the open beam; seeds are of the noise alone. "wide" is a peer's own way
 slices as wide as the sample, of whose width it is told.
 
 dB: PSNR within 0.95 of the field's circle, over the largest density, values clipped at 0. Fraction: of voxels over half
-way between matrix and grains, inside the can's wall, over the true one's. Cracks: share found where 2 % of planes
-without a crack are taken for one, see `cracks_found`. CPU seconds are of the volume alone, on one thread by default;
-what compiles did so before. Memory: peak of the process, which makes this volume alone, with all that it imports.
+way between matrix and grains, inside the can's wall, over the true one's. Cracks: depth over the true
+one, of 0.5 to 1, 1 to 1.5 and 1.5 to 2 voxels, see `crack_depths`. CPU seconds are of the volume alone, on one thread
+by default; what compiles did so before. Memory: peak of the process, which makes this volume alone, with all that it
+imports.
 
 The best setting is best by dB, which no user knows: from its first value the sweep climbs until it has seen lower
 quality on both sides, for the first seed; further seeds take that setting. Slices that do not know each other (ASTRA)
@@ -34,7 +35,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from itertools import product
+from itertools import pairwise, product
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
@@ -51,10 +52,13 @@ from tests.bench.quality_cases import Case, rows_of
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-VERSION = 1
+Depths = tuple[float | None, float | None, float | None]
+VERSION = 2
 """Of scenes and figures: scores of another one do not belong into the same table."""
-FALSE, BESIDE, ACROSS, POINTS, FEWEST = 0.02, 2.5, 0.6, 60, 15
-"""Share of controls taken for cracks; planes beside a plane, voxels away; disc over the plane's; points, and fewest."""
+BESIDE, ACROSS, POINTS, FEWEST = 2.5, 0.6, 60, 15
+"""Planes beside a plane, voxels away; disc over the plane's; points, and fewest."""
+WIDTHS = 0.5, 1.0, 1.5, 2.0
+"""Widths of cracks in voxels, between which depths are told apart."""
 
 
 class Cell(NamedTuple):
@@ -80,16 +84,19 @@ class Score(NamedTuple):
 
     quality: float | None
     fraction: float | None
-    cracks: float | None
+    thin: float | None
+    medium: float | None
+    thick: float | None
     seconds: float
     memory: float
 
 
-def cracks_found(volume: F32, planes: Planes) -> float:
-    """Share of the cracks darker than 98 % of the controls.
+def crack_depths(volume: F32, truth: F32, planes: Planes) -> Depths:
+    """Depth of cracks over the true one, by width as `WIDTHS`; None: there is no crack so wide.
 
-    The darkness of a plane is the mean of a disc in it below that of two discs 2.5 voxels beside it, all within the
-    same ball. Discs of which fewer than 15 of 60 points lie in the rows and within 0.95 of the field do not count.
+    The depth is the mean of a disc in the crack below that of two discs `BESIDE` voxels beside it, all within the same
+    ball, by linear interpolation. Discs of which fewer than 15 of 60 points lie in the rows and within 0.95 of the
+    field do not count.
     """
     turn, out = np.arange(POINTS) * np.pi * (3 - math.sqrt(5)), np.sqrt((np.arange(POINTS) + 0.5) / POINTS)
     least = np.eye(3)[np.argmin(np.abs(planes.normal), axis=1)]
@@ -99,25 +106,25 @@ def cracks_found(volume: F32, planes: Planes) -> float:
     flat = out * np.cos(turn) * one[..., None] + out * np.sin(turn) * other[..., None]
     disc = planes.centre[..., None] + ACROSS * planes.radius[:, None, None] * flat  # [plane, xyz, point]
     middle = (np.array(volume.shape[::-1]) - 1) / 2
+    discs = [disc + beside * planes.normal[..., None] for beside in (-BESIDE, 0, BESIDE)]
+    within = [
+        (np.abs(at[:, 2]) <= middle[2]) & (np.hypot(at[:, 0], at[:, 1]) < 0.95 * volume.shape[2] / 2) for at in discs
+    ]
+    counts = np.logical_and.reduce(within)
 
-    def seen(beside: float) -> tuple[F64, NDArray[np.bool_]]:
-        at = disc + beside * planes.normal[..., None]
-        there = (np.abs(at[:, 2]) <= middle[2]) & (np.hypot(at[:, 0], at[:, 1]) < 0.95 * volume.shape[2] / 2)
-        points = (at + middle[:, None])[:, ::-1].transpose(1, 0, 2)
-        return map_coordinates(volume, points, order=1, mode="nearest", output=np.float64), there
+    def depth(of: F32) -> F64:
+        places = [(at + middle[:, None])[:, ::-1].transpose(1, 0, 2) for at in discs]
+        low, own, high = (map_coordinates(of, at, order=1, mode="nearest", output=np.float64) for at in places)
+        return np.asarray((((low + high) / 2 - own) * counts).sum(1))
 
-    (low, a), (own, b), (high, c) = seen(-BESIDE), seen(0), seen(BESIDE)
-    counts = a & b & c
-    some = counts.sum(1) >= FEWEST
-    if not (some & (planes.width > 0)).any() or not (some & (planes.width == 0)).any():
-        return math.nan
-    dark = (((low + high) / 2 - own) * counts).sum(1)[some] / counts.sum(1)[some]
-    crack = planes.width[some] > 0
-    return float(np.mean(dark[crack] > np.quantile(dark[~crack], 1 - FALSE)))
+    made, true, some = depth(volume), depth(truth), counts.sum(1) >= FEWEST
+    wide = [some & (low <= planes.width) & (planes.width < high) for low, high in pairwise(WIDTHS)]
+    thin, medium, thick = (float(made[each].sum() / true[each].sum()) if each.any() else None for each in wide)
+    return thin, medium, thick
 
 
-def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float, float, float | None]:
-    """dB, fraction of grains over the true one, and share of cracks found (all rows of such a scene only)."""
+def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float, float, *Depths]:
+    """dB, fraction of grains over the true one, and depths of cracks by width (all rows of such a scene only)."""
     volume, truth = np.maximum(volume, 0), scene.truth[list(rows)]
     x = np.arange(truth.shape[2]) - (truth.shape[2] - 1) / 2
     away, field = np.hypot(x[:, None], x), 0.95 * truth.shape[2] / 2
@@ -125,9 +132,9 @@ def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float, float
     inside, half_way = away < min(field, scene.inner - 2), sum(scene.levels) / 2
     fraction = np.mean(volume[:, inside] > half_way) / np.mean(truth[:, inside] > half_way)
     whole = scene.planes is not None and len(rows) == len(scene.truth)
-    found = cracks_found(volume, scene.planes) if whole and scene.planes else math.nan
+    depths = crack_depths(volume, truth, scene.planes) if whole and scene.planes else (None, None, None)
     quality = 10 * math.log10(float(scene.truth.max()) ** 2 / error)
-    return quality, float(fraction), None if math.isnan(found) else found
+    return quality, float(fraction), *depths
 
 
 def noisy(cell: Cell, scene: Scene) -> F32:
@@ -169,7 +176,7 @@ def play(cell: Cell, name: str, value: Value, limit: float) -> Score | None:
         theirs.close()
         process.join()
         if process.exitcode == -signal.SIGXCPU:
-            return Score(None, None, None, limit, 0.0)
+            return Score(None, None, None, None, None, limit, 0.0)
         if process.exitcode:
             print(f"{cell} {name}: ended with status {process.exitcode}", file=sys.stderr, flush=True)
             return None
@@ -199,8 +206,14 @@ class Kept:
         for key, row in rows.items():
             parts = key.split("|")
             numbers = isinstance(row, list) and all(isinstance(x, int | float) for x in row if x is not None)
-            good = len(parts) == 8 and parts[0] in SCENES and parts[6] in ENTRANTS and numbers and len(row) == 5
-            if not good or None in row[3:] or not all(math.isfinite(x) for x in row if x is not None):
+            good = (
+                len(parts) == 8
+                and parts[0] in SCENES
+                and parts[6] in ENTRANTS
+                and numbers
+                and len(row) == len(Score._fields)
+            )
+            if not good or None in row[-2:] or not all(math.isfinite(x) for x in row if x is not None):
                 raise ValueError(f"{self.path}: the score {key!r}: {row!r} is damaged; delete it, or {advice}")
         return {key: Score(*row) for key, row in rows.items()}
 
@@ -282,8 +295,9 @@ def _shown(scores: Sequence[Score]) -> str:
     text = f"{statistics.median(quality):.2f}"
     text += f" ({min(quality):.2f} to {max(quality):.2f})" if len(quality) > 1 else ""
     text += f", {statistics.median(score.fraction or 0 for score in made):.2f}"
-    if found := [score.cracks for score in made if score.cracks is not None]:
-        text += f", {100 * statistics.median(found):.0f} %"
+    for depths in zip(*((score.thin, score.medium, score.thick) for score in made), strict=True):
+        if known := [depth for depth in depths if depth is not None]:
+            text += f", {statistics.median(known):.2f}"
     seconds = statistics.median(score.seconds for score in made)
     return text + (f", {seconds:.0f} s" if seconds >= 10 else f", {seconds:.2g} s")
 

@@ -318,6 +318,7 @@ ENTRANTS: dict[str, Entrant] = {
     "fbp": Entrant(_own(_fbp), "filter", {0: DEFAULT, 1: "shepp-logan", 2: "ram-lak"}.get),
     "fista-tv": Entrant(_own(lambda value: recon.FistaTv(tv_weight=value)), "weight", lambda k: 1e-3 * 2**k),
     "pnp-dct": Entrant(_own(lambda value: recon.PnpDct(patch_threshold=value)), "threshold", lambda k: 0.04 * 2**k),
+    "discrete": Entrant(_own(lambda value: recon.Discrete())),
     "r2": Entrant(_own(lambda value: recon.R2())),
     "auto": Entrant(_own(lambda value: recon.Auto())),
     **dict(_peers()),

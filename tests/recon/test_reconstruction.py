@@ -106,7 +106,7 @@ OF_A_FIT: dict[str, dict[str, object]] = {
 
 
 OF_FITS = r"\(of r2, r2-published\)"
-ON_DEVICES = r"\(of r2, fista-tv, pnp-dct, r2-published"
+ON_DEVICES = r"\(of r2, fista-tv, pnp-dct, discrete, r2-published"
 OWNERS = {
     "times": r"\(of series\)", "device 'cuda'": ON_DEVICES,
 }  # fmt: skip

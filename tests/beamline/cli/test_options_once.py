@@ -21,7 +21,8 @@ OPTIONS = declared(recon)
 TYPED = {
     "steps": "5", "seconds": "5", "budget": "30s", "quality": "best", "gaussians": "9", "start": "tv", "loss": "l2",
     "kernel": "gaussian", "device": "cuda", "early-stop": "", "finish": "2", "checkpoint": "c.h5", "resume": __file__,
-    "iterations": "3", "tv-weight": "0.1", "patch-threshold": "0.1", "allow-negative": "", "volumes": "3", "moves": "",
+    "iterations": "3", "tv-weight": "0.1", "patch-threshold": "0.1", "levels": "0.1,0.5",
+    "allow-negative": "", "volumes": "3", "moves": "",
     "plain-splatting": "", "uncertainty": "", "truth": "t.npy", "follow": "", "previous-part": "e.h5",
     "unfinished": "", "memory": "8G", "cluster": "local:1", "roi": "0:1,0:1,0:1",
     "dry-run": "",

@@ -30,7 +30,7 @@ from tests.clock import SteppedClock
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(6, 40))
-SECONDS = {"fbp": 1.0, "fista-tv": 10.0, "pnp-dct": 30.0, "r2": 20.0}
+SECONDS = {"fbp": 1.0, "fista-tv": 10.0, "discrete": 15.0, "pnp-dct": 30.0, "r2": 20.0}
 
 
 def expected(self: Timing, method: Method) -> Forecast:
@@ -42,10 +42,11 @@ def expected(self: Timing, method: Method) -> Forecast:
 @pytest.mark.parametrize(
     ("budget", "left", "late"),
     [
-        (99.0, ["fbp", "fista-tv", "pnp-dct", "r2"], False),
-        (60.0, ["fbp", "fista-tv", "r2"], False),
-        (36.0, ["fbp", "fista-tv", "r2"], False),
-        (35.0, ["fbp", "fista-tv"], False),
+        (99.0, ["fbp", "fista-tv", "discrete", "pnp-dct", "r2"], False),
+        (60.0, ["fbp", "fista-tv", "discrete", "r2"], False),
+        (44.0, ["fbp", "fista-tv", "discrete", "r2"], False),
+        (42.0, ["fbp", "fista-tv", "discrete"], False),
+        (27.0, ["fbp", "fista-tv"], False),
         (15.0, ["fbp"], False),
         (0.5, ["fbp"], True),
     ],

@@ -1,0 +1,100 @@
+"""Which few materials, and how strong a pull to them: by views held out, and none where they do not tell."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recon.base.arrays import F64
+from recon.base.decisions import MaterialPrior
+from recon.base.empirical import ONE_IN
+from recon.features.discrete.mixture import MaterialPull, fitted_levels
+from recon.voxels.choice import LEAST_GAIN, significantly_better
+from recon.voxels.trial import Trial
+from recon.voxels.voxel_problem import VoxelProblem
+
+PULLS = (0.02, 0.005)
+"""c, from strong to weak: the strong one takes 2 to 4 dB from smooth matter, and is refused there."""
+COUNTS = (2, 3)
+"""Numbers of materials, air among them or not; four are tried where three are best."""
+_FIRST_SHARE, _LEAST_SHARE = 0.5, 1 / 16  # of the weight of total variation
+
+
+def in_field(problem: VoxelProblem) -> NDArray[np.bool_]:
+    """[y, x, z] voxels that some view sees in each turn: those beyond have no rays enough to tell materials."""
+    _, y, x = problem.projector.grid.coordinates()
+    field = np.hypot(y[:, None], x) < problem.projector.geometry.reach
+    return np.repeat(field[:, :, None], problem.projector.grid.shape[0], axis=2)
+
+
+class MaterialTrial:
+    """Volumes pulled to a few materials, made of the views of a trial and judged by those held out.
+
+    Attributes:
+        smooth: residuals [view] of total variation alone.
+        best, materials: the least residuals, and the materials of that volume; those of total variation, and none,
+            where few materials do not predict significantly better.
+    """
+
+    def __init__(self, trial: Trial, weight: float, sweeps: int, levels: Sequence[float] | None) -> None:
+        """For the weight of total variation of all views; `levels` in the units of the trial, None: by EM."""
+        self._trial, self._sweeps, self._levels = trial, sweeps, levels
+        self._weight = weight / math.sqrt(ONE_IN / (ONE_IN - 1))  # see `choose_weight`
+        self._start = trial.volume_of_weight(self._weight) if trial.smooth is None else trial.smooth
+        self._where = in_field(trial.problem)
+        self.smooth = trial.residuals(self._start)
+        self.best, self.materials = self.smooth, MaterialPrior()
+
+    def choose(self) -> None:
+        """Choose number of materials, share of total variation and pull."""
+        first, *others = COUNTS if self._levels is None else (len(self._levels),)
+        best, chosen = self._tried(first, _FIRST_SHARE, PULLS[0])
+        for count in others:
+            best, chosen = self._better(best, chosen, count)
+        if self._levels is None and len(chosen.levels) == COUNTS[-1]:
+            best, chosen = self._better(best, chosen, COUNTS[-1] + 1)
+        count = len(chosen.levels)
+        if not count:
+            return
+        whole = self._tried(count, 1.0, PULLS[0])
+        if significantly_better(best, whole[0], LEAST_GAIN):
+            before = None
+            while before is not chosen and chosen.tv_share > _LEAST_SHARE:
+                before = chosen
+                best, chosen = self._better(best, chosen, count, chosen.tv_share / 2)
+        else:
+            best, chosen = whole
+        for pull in PULLS[1:]:
+            best, chosen = self._better(best, chosen, count, chosen.tv_share, pull)
+        if not significantly_better(best, self.smooth, LEAST_GAIN):
+            return
+        # As many sweeps more of total variation predict smooth matter by 3 % better, too.
+        continued = self._trial.volume_of_weight(self._weight, self._start, self._sweeps)
+        if significantly_better(best, self._trial.residuals(continued), LEAST_GAIN):
+            self.best, self.materials = best, chosen
+
+    def _better(
+        self, best: F64, chosen: MaterialPrior, count: int, tv_share: float = _FIRST_SHARE, pull: float = PULLS[0]
+    ) -> tuple[F64, MaterialPrior]:
+        """The best so far, or this one if it predicts significantly better."""
+        residuals, materials = self._tried(count, tv_share, pull)
+        if significantly_better(residuals, best, LEAST_GAIN):
+            return residuals, materials
+        return best, chosen
+
+    def _tried(self, count: int, tv_share: float, pull: float) -> tuple[F64, MaterialPrior]:
+        """Residuals [view] of a volume, and its materials; infinite, and none, where there are not so many levels."""
+        levels, weights = (
+            fitted_levels(self._start[self._where], count)
+            if self._levels is None
+            else (np.array(self._levels), np.full(count, 1 / count))
+        )
+        if self._trial.ended or not np.diff(levels).min() > 0:
+            return np.full(self.smooth.shape, np.inf), MaterialPrior()
+        first = MaterialPrior(tuple(levels.tolist()), tuple(weights.tolist()), tv_share, pull)
+        towards = MaterialPull(first, self._where, follows=self._levels is None)
+        x = self._trial.volume_of_weight(self._weight * tv_share, self._start, self._sweeps, towards)
+        return self._trial.residuals(x), towards.materials_in(x)

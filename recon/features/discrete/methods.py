@@ -1,0 +1,152 @@
+"""Discrete tomography with partial voxels: total variation, then a pull to few materials where these predict views."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from recon.base.arrays import F32
+from recon.base.decisions import Decisions, GoesOn, MaterialPrior, Prior
+from recon.base.empirical import FEWEST_SUBSETS
+from recon.base.method import Plain, ReconProblem, Reconstruction, RunControl
+from recon.base.setting import Count
+from recon.features.discrete.choose import PULLS, MaterialTrial, in_field
+from recon.features.discrete.mixture import MaterialPull, probabilities
+from recon.voxels.choice import Prediction, TrialChoice
+from recon.voxels.held_out import CHOICE_SWEEPS
+from recon.voxels.iterative import VoxelMethod
+from recon.voxels.methods import FistaTv
+from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
+from recon.voxels.projector import volume_lines
+from recon.voxels.trial import SUBSETS, TV_STEPS, Trial
+from recon.voxels.voxel_problem import Buffers, VoxelProblem
+
+MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
+"""Names of the decisions on the materials, in the units of the scan, and on the share of voxels that are more likely
+partial than of one material; and how settings end that state the materials."""
+_TRIALS = 6  # trials of materials, as a rule
+
+
+@dataclass(frozen=True)
+class Discrete(VoxelMethod):
+    """FISTA-TV, then min ½||A x - p||² + μ TV(x) + β Σ φ(x), x >= 0, where φ pulls voxels to a few materials and leaves
+    partial voxels between them; see `recon.features.discrete.mixture`. Memory: as `FistaTv`, and 2 volumes.
+
+    Views held out choose the number of materials, their levels, what remains of μ, and β. Where few materials do not
+    predict them significantly better, and where none can be held out, the volume is that of FISTA-TV. From a first
+    volume it goes on by total variation alone.
+
+    Attributes:
+        iterations: passes over all views after those of FISTA-TV.
+        levels: densities of the materials in 1/mm, ascending; None: by EM. Where no views can be held out, voxels are
+            pulled weakly to levels that are given.
+    """
+
+    name: ClassVar[str] = "discrete"
+    label: ClassVar[str] = "Discrete"
+    takes: ClassVar[frozenset[str]] = frozenset({"device"})
+    halo: ClassVar[int] = FistaTv.halo + 12
+    error_bars: ClassVar[tuple[float, float] | None] = 2.2, 0.1
+    buffers: ClassVar[Buffers] = Buffers(9.3, 3.0, 4.8, filtered=True)
+    first_sweeps: ClassVar[int] = FistaTv.iterations
+
+    iterations: Count = 16
+    levels: tuple[float, ...] | None = None
+    allow_negative: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.levels is not None and not (len(self.levels) > 1 and all(np.diff(self.levels) > 0)):
+            raise ValueError(f"levels are {self.levels}: expected two or more, each above the one before")
+
+    @property
+    def trial_sweeps(self) -> int:
+        """Sweeps for the weight of total variation, and with materials."""
+        return CHOICE_SWEEPS + _TRIALS * self.iterations
+
+    @classmethod
+    def ended_by(cls, seconds: float) -> dict[str, Plain]:
+        """None: levels need the sweeps of the trials."""
+        return {}
+
+    def toy(self) -> Self:
+        return replace(self, iterations=1, levels=(0.0, 1.0))
+
+    def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
+        """The prediction of the best few materials, or else that of total variation."""
+        if trial.weight is None:
+            return Prediction(self.name, remark=f"{self.name}: no weight of total variation could be chosen")
+        found = self._choice(trial, trial.weight)
+        return trial.prediction(self.name, found.best, Prior(trial.weight, materials=found.materials))
+
+    def iterate(self, problem: VoxelProblem, x: F32) -> F32:
+        if x.any():  # a pull would hide the noise that refits for error bars show
+            return FistaTv(iterations=self.iterations).iterate(problem, x)
+        first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
+        x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
+        density = problem.units.density
+        kept: list[Any] = problem.decide(
+            MATERIALS, lambda: [*self._materials(problem, weight, trial()).scaled(density)]
+        )
+        materials = MaterialPrior(*kept).scaled(-density)
+        if not (materials.levels and first.going):
+            return x
+        where = in_field(problem)
+        further = replace(problem, go_on=lambda sweep, left: problem.go_on(self.first_sweeps + sweep, left))
+        mu = weight.value if isinstance(weight, NoiseBalance) else weight
+        subsets = Subsets.of(problem, SUBSETS, FEWEST_SUBSETS)
+        x = ordered_fista(
+            further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS,
+            pull=MaterialPull(materials, where),
+        )  # fmt: skip
+        problem.decide(UNDECIDED, lambda: float(np.mean(probabilities(x, materials).max(0)[where] <= 0.5)))
+        return x
+
+    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+        """The volume; its settings have the materials, and the share of voxels that are none of them for certain.
+
+        Raises:
+            ValueError: as `solve`.
+        """
+        decide = control.decide or Decisions(problem.seed)
+        result = super().run(problem, replace(control, decide=decide))
+        materials = MaterialPrior(*decide.made.get(MATERIALS, [()])[-1])
+        found = {name + _OF: value for name, value in materials._asdict().items()}
+        share = {UNDECIDED: decide.made[UNDECIDED][-1]} if UNDECIDED in decide.made else {}
+        return replace(result, settings={**result.settings, **(found if materials.levels else {}), **share})
+
+    def _materials(self, problem: VoxelProblem, weight: NoiseBalance | float, trial: Trial | None) -> MaterialPrior:
+        """In the units of the problem; without levels where few materials do not predict the views held out."""
+        if problem.prior is not None and problem.prior.materials is not None:
+            return problem.prior.materials
+        if trial is None or isinstance(weight, NoiseBalance):
+            levels = self.levels or ()
+            weights = tuple(1 / len(levels) for _ in levels)
+            return MaterialPrior(levels, weights, 1.0, PULLS[-1]).scaled(-problem.units.density)
+        return self._choice(trial, weight).materials
+
+    def _choice(self, trial: Trial, weight: float) -> MaterialTrial:
+        unit = -trial.problem.units.density
+        levels = None if self.levels is None else [math.ldexp(level, unit) for level in self.levels]
+        found = MaterialTrial(trial, weight, self.iterations, levels)
+        found.choose()
+        return found
+
+
+def probabilities_of(result: Reconstruction) -> F32:
+    """[material, z, y, x] probability that a voxel of a volume of `Discrete` is of one material, in ascending order.
+
+    What is missing to 1 is that of a partial voxel.
+
+    Raises:
+        ValueError: the volume was not pulled to few materials.
+    """
+    given: list[Any] = [result.settings.get(name + _OF) for name in MaterialPrior._fields]
+    if not given[0]:
+        raise ValueError("the volume has no materials: views held out did not prefer them; nothing was computed")
+    found = probabilities(volume_lines(result.volume.data), MaterialPrior(*given))
+    return np.ascontiguousarray(found.transpose(0, 3, 1, 2))

@@ -1,0 +1,109 @@
+"""Discrete tomography: what it gains on grains of two materials, and where few materials are refused."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+import recon
+from recon.base.decisions import Decisions
+from recon.features.discrete.methods import UNDECIDED, probabilities_of
+from recon.voxels.methods import PnpDct
+from recon.voxels.projector import Projector
+
+F32 = NDArray[np.float32]
+VIEWS = recon.Geometry.parallel(np.arange(20) * np.pi / 20, (6, 64))
+GRID = recon.Grid.matching(VIEWS)
+
+
+def grains() -> F32:
+    """Balls of 0.05 in a can of 0.015, with partial voxels at their faces."""
+    rng, (z, y, x) = np.random.default_rng(2), np.meshgrid(*GRID.coordinates(), indexing="ij")
+    truth = 0.015 * np.clip(28.5 - np.hypot(x, y), 0, 1)
+    for _ in range(300):
+        (r, turn, height), away = rng.uniform((2, 0, -5), (3.5, 2 * np.pi, 5)), 24 * math.sqrt(rng.uniform())
+        far = np.sqrt((x - away * np.cos(turn)) ** 2 + (y - away * np.sin(turn)) ** 2 + (z - height) ** 2)
+        truth = np.maximum(truth, 0.015 + 0.035 * np.clip(r + 0.5 - far, 0, 1))
+    return truth.astype(np.float32)
+
+
+def smooth() -> F32:
+    away = np.hypot(*np.meshgrid(GRID.coordinates()[1], GRID.coordinates()[2], indexing="ij"))
+    noise = gaussian_filter(np.random.default_rng(0).normal(0, 1, GRID.shape), (2, 5, 5))
+    return ((0.03 + 0.01 * noise / noise.std()).clip(0) * (away < 28)).astype(np.float32)
+
+
+def measured(truth: F32) -> F32:
+    clean = Projector(VIEWS, GRID).forward(truth)
+    counts = np.random.default_rng(0).poisson(3e4 * np.exp(-clean.astype(float)))
+    return -np.log(counts / 3e4).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def of_grains() -> recon.Reconstruction:
+    return recon.reconstruct(measured(grains()), VIEWS, recon.Discrete())
+
+
+def error(volume: F32, truth: F32) -> float:
+    return float(np.sqrt(np.mean((volume - truth) ** 2)))
+
+
+@pytest.mark.slow
+def test_grains_of_two_materials_are_nearer_to_the_truth(of_grains: recon.Reconstruction) -> None:
+    tv = recon.reconstruct(measured(grains()), VIEWS, recon.FistaTv()).volume.data
+    assert error(of_grains.volume.data, grains()) < 0.9 * error(tv, grains())
+    levels = of_grains.settings["levels_of_materials"]
+    assert len(levels) == 2
+    np.testing.assert_allclose(levels, (0.015, 0.05), atol=0.002)
+    assert 0 < of_grains.settings[UNDECIDED] < 1
+
+
+@pytest.mark.slow
+def test_the_probability_of_each_material_is_there_on_demand(of_grains: recon.Reconstruction) -> None:
+    p, truth = probabilities_of(of_grains), grains()
+    assert p.shape == (2, *GRID.shape)
+    assert p[1][truth == 0.05].mean() > 3 * p[1][truth == 0.015].mean()
+
+
+@pytest.mark.slow
+def test_smooth_matter_is_that_of_total_variation() -> None:
+    data = measured(smooth())
+    found = recon.reconstruct(data, VIEWS, recon.Discrete())
+    np.testing.assert_array_equal(found.volume.data, recon.reconstruct(data, VIEWS, recon.FistaTv()).volume.data)
+    assert "levels_of_materials" not in found.settings
+    with pytest.raises(ValueError, match="no materials"):
+        probabilities_of(found)
+
+
+@pytest.mark.slow
+def test_auto_takes_it_for_grains_and_does_not_try_patches() -> None:
+    found = recon.reconstruct(measured(grains()), VIEWS, recon.Auto((recon.FistaTv(), recon.Discrete(), PnpDct())))
+    assert found.method == "discrete"
+    assert "pnp-dct: not tried" in found.settings["chosen_because"]
+    assert "levels_of_materials" in found.settings
+
+
+@pytest.mark.slow
+def test_another_slab_has_the_materials_of_the_first(of_grains: recon.Reconstruction) -> None:
+    first, data = Decisions(), measured(grains())
+    recon.reconstruct(data, VIEWS, recon.Discrete(), control=recon.RunControl(decide=first))
+    control = recon.RunControl(decide=Decisions(0, first.made))
+    other = recon.reconstruct(data[:, :3], VIEWS.rows(0, 3), recon.Discrete(), control=control)
+    assert other.settings["levels_of_materials"] == of_grains.settings["levels_of_materials"]
+
+
+@pytest.mark.slow
+def test_levels_that_are_given_are_those_of_the_volume() -> None:
+    found = recon.reconstruct(measured(grains()), VIEWS, recon.Discrete(levels=(0.015, 0.05)))
+    np.testing.assert_allclose(found.settings["levels_of_materials"], (0.015, 0.05))
+
+
+@pytest.mark.parametrize("levels", [(0.1,), (0.2, 0.1), (0.1, 0.1)])
+def test_levels_that_do_not_ascend_are_refused(levels: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="each above the one before"):
+        replace(recon.Discrete(), levels=levels)
