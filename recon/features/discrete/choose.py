@@ -57,7 +57,8 @@ class MaterialTrial:
         if self._levels is None and len(chosen.levels) == COUNTS[-1]:
             best, chosen = self._better(best, chosen, COUNTS[-1] + 1)
         count = len(chosen.levels)
-        if not count:
+        # Of a tooth and of a rod with a pin of metal the best is 0.3 and 1 % worse here, of packed grains 4 % better.
+        if not count or np.square(best).sum() >= np.square(self.smooth).sum():
             return
         whole = self._tried(count, 1.0, PULLS[0])
         if significantly_better(best, whole[0], LEAST_GAIN):
