@@ -45,8 +45,8 @@ FOR_PACKAGES = {
     "beamline.config.beam": ("NoBeamMonitor",),
     "beamline.config.load": ("load_as", "resolved_yaml"),
     "beamline.config.models": (
-        "Degrees", "Fields", "OpticsSection", "ReconSection", "SampleSection", "Seconds", "StorageSection", "Views",
-        "TargetSection",
+        "Config", "Degrees", "Fields", "OpticsSection", "ReconSection", "SampleSection", "Seconds", "StorageSection",
+        "TargetSection", "Views",
     ),
     "beamline.config.monitor": ("MonitorSection", "ReferencesSection"),
     "beamline.config.section": ("Section", "section_of"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from typing import Any
 
 import h5py
 import hdf5plugin
@@ -33,7 +34,7 @@ def _lz4(payload: bytes, n_bytes: int, item: int) -> bytes:
     return struct.pack(">QII", n_bytes, n_bytes, len(payload)) + payload
 
 
-_CODECS: dict[str, tuple[Callable[[], object], Callable[[bytes, int, int], bytes]]] = {
+_CODECS: dict[str, tuple[Callable[[], Any], Callable[[bytes, int, int], bytes]]] = {
     "blosc": (hdf5plugin.Blosc, _bare),
     "bslz4": (hdf5plugin.Bitshuffle, _bslz4),
     "lz4": (hdf5plugin.LZ4, _lz4),
@@ -42,7 +43,7 @@ _CODECS: dict[str, tuple[Callable[[], object], Callable[[bytes, int, int], bytes
 NAMES = (*_CODECS,)
 
 
-def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtype: np.dtype) -> NDArray:
+def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtype: np.dtype[Any]) -> NDArray[Any]:
     """The pixels [row, col] of a compressed frame, little-endian as nearly all IOCs are: the message does not say.
 
     Args:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, cast
 
 from pydantic import Field, model_validator
 
 from beamline.config.beam import NoBeamMonitor
 from beamline.config.models import (
+    Config,
     Degrees,
     Fields,
     OpticsSection,
@@ -132,6 +133,11 @@ class RideConfig(Section):
     monitor: MonitorSection = MonitorSection()
     references: ReferencesSection = ReferencesSection()
     recon: ReconSection = ReconSection()
+
+    @property
+    def as_scan(self) -> Config:
+        """This configuration for what takes one of a scan: its sections have the names and types of those."""
+        return cast(Config, self)
 
     @property
     def devices(self) -> _Devices:

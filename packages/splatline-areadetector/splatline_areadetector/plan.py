@@ -128,7 +128,7 @@ def ready_of(config: RideConfig, plan: RidePlan, first: ArrayFrame, runs: Path) 
         devices={"areadetector": _described(config, first)},
         saturation=float(2**bits - 1),
     )
-    return ready_scan(config, timeline, settings, timing, info)
+    return ready_scan(config.as_scan, timeline, settings, timing, info)
 
 
 def _described(config: RideConfig, first: ArrayFrame) -> dict[str, str | int | float]:

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError, InstrumentError
+from beamline.core.errors import DataError, InstrumentError, ScanStopped
 from beamline.core.events import BlockDone, BlockStarted, StateEntered, Warned
-from beamline.core.stop import ScanAborted, ScanStopped
+from beamline.core.stop import ScanAborted
 from beamline.core.text import count, spans
 from beamline.scan.control import State
 from beamline.scan.ledger import LedgerError

@@ -99,7 +99,14 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> list[RunResul
         try:
             results.append(
                 record_scan(
-                    ride.config, ready, source_of, ride.runs, sinks, ride.stop, instrument=instrument, live=command
+                    ride.config.as_scan,
+                    ready,
+                    source_of,
+                    ride.runs,
+                    sinks,
+                    ride.stop,
+                    instrument=instrument,
+                    live=command,
                 )
             )
         except LedgerError as error:
@@ -120,7 +127,7 @@ def _instrument() -> ConnectedDevices:
 def _follow(config: RideConfig, first: ArrayFrame, plan: RidePlan) -> LiveCommand | None:
     if not config.recon.live:
         return None
-    return follow_command(config, live_plan(first.window.shape, plan.angles.size, free_memory()))
+    return follow_command(config.as_scan, live_plan(first.window.shape, plan.angles.size, free_memory()))
 
 
 def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:

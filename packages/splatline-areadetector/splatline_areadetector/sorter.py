@@ -91,12 +91,14 @@ class Sorter:
             reconnected: the server had gone since the frame before.
         """
         current = self._taken.get(self._now)
-        fell = current is not None and unique_id < current.last_id
-        if fell and (reconnected or (phase.serial == self._serial and not self._is_over(current))):
-            return NewEpoch(
-                f"frame numbers began anew at {unique_id}, after {current.last_id}: the server restarted, or its "
-                "counter was reset"
-            )
+        fell = False
+        if current is not None and unique_id < current.last_id:
+            fell = True
+            if reconnected or (phase.serial == self._serial and not self._is_over(current)):
+                return NewEpoch(
+                    f"frame numbers began anew at {unique_id}, after {current.last_id}: the server restarted, or its "
+                    "counter was reset"
+                )
         if phase.kind is None:
             return Outside()
         if phase.serial != self._serial or current is None:
