@@ -70,7 +70,10 @@ def _lean(rays, v, first, end, shifts, offsets):
 
 @njit(inline="always")
 def _row(rays, v, col, j):
-    """The first of the four rows that a ray runs between, and how far behind it lies in line j, for the first lane."""
+    """The first of the four rows that a ray runs between, and how far behind it lies in line j, for the first lane.
+
+    Where a ray meets a voxel exactly, calls may be compiled to round differently, and rows then differ by one.
+    """
     at = rays[v, col, 0] + rays[v, col, 1] * j
     row = math.floor(at - 1.0)
     return row, _f(at - row)
@@ -94,7 +97,7 @@ def _forward(ys: F32, xs: F32, shape: tuple[int, int], rays: F64, steep: Flags, 
                     if high <= low:
                         continue
                     one, other = _row(rays, v, low, j)[0], _row(rays, v, high - 1, j)[0]
-                    top, bottom = min(one, other), max(one, other) + 4
+                    top, bottom = min(one, other) - 1, max(one, other) + 5  # see _row
                     for row in range(0, bottom - top, _BAND):
                         lanes.load_turned(lines, j, _BEFORE + top + row, shifts, band, row)
                     offset = lanes.load(offsets, 0, 0)
@@ -131,7 +134,7 @@ def _adjoint(
                 low, high = _crossing(rays, v, first, last, j, n)
                 if high > low:
                     one, other = _row(rays, v, low, j)[0], _row(rays, v, high - 1, j)[0]
-                    top, bottom = min(one, other), max(one, other) + 4
+                    top, bottom = min(one, other) - 1, max(one, other) + 5  # see _row
                     count = (bottom - top + _BAND - 1) // _BAND * _BAND
                     band[:count] = _f(0)
                     offset = lanes.load(offsets, 0, 0)
