@@ -33,7 +33,8 @@ FOR_PACKAGES = {
     ),
     "beamline.cli.terminal": ("Answer", "PageBeside", "Terminal", "answering"),
     "beamline.core.errors": (
-        "AlarmError", "BeamlineError", "ConfigError", "DataError", "InstrumentError", "QualityError", "user_message",
+        "AlarmError", "BeamlineError", "ConfigError", "DataError", "InstrumentError", "QualityError", "ScanStopped",
+        "user_message",
     ),
     "beamline.core.files": ("refuse_existing", "text_in", "atomic_file", "write_together", "write_whole"),
     "beamline.core.text": ("count", "csv_text", "safe_name", "size", "spans"),
@@ -41,7 +42,7 @@ FOR_PACKAGES = {
     "beamline.core.events": ("BlockDone", "BlockStarted", "Sink", "StateEntered", "Warned", "json_of"),
     "beamline.core.machine": ("free_memory",),
     "beamline.core.run_result": ("RunResult",),
-    "beamline.core.stop": ("ScanAborted", "ScanStopped", "StopRequest", "stop_signals"),
+    "beamline.core.stop": ("ScanAborted", "StopRequest", "stop_signals"),
     "beamline.config.beam": ("NoBeamMonitor",),
     "beamline.config.load": ("load_as", "resolved_yaml"),
     "beamline.config.models": (

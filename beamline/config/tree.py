@@ -84,7 +84,8 @@ def read(text: str, name: str) -> Tree:
         group = data.get(old[0])
         if isinstance(group, dict) and old[1] in group and new not in group:
             group[new] = group.pop(old[1])
-            origins = {(*_present_name(path[:2]), *path[2:]): place for path, place in origins.items()}
+            now = old[0], new
+            origins = {(*now, *path[2:]) if path[:2] == old else path: place for path, place in origins.items()}
     return Tree(data, origins)
 
 

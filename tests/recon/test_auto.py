@@ -115,7 +115,7 @@ def test_patches_are_not_tried_of_a_sample_wider_than_the_field(data: F32, monke
             return trial.predicted(self)
 
     choice = Auto((Asking(), recon.PnpDct())).choose(problem, recon.RunControl())
-    assert choice.at == 0 and "pnp-dct not tried of a sample wider than the field" in choice.reason
+    assert choice.at == 0 and "pnp-dct not tried, as the sample is wider than the field" in choice.reason
     assert priors == [Prior(0.5)]  # and none is sought for its volume
 
 

@@ -13,8 +13,8 @@ import pytest
 from fake_ioc import TOMOSCAN, FakeIoc, array_value, counts_of
 from ridden import config_of, ride_along, stored
 
-from beamline.core.errors import ConfigError, DataError
-from beamline.core.stop import ScanAborted, ScanStopped, StopRequest
+from beamline.core.errors import ConfigError, DataError, ScanStopped
+from beamline.core.stop import ScanAborted, StopRequest
 from beamline.scan.ledger import LedgerError
 from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import FrameKind

@@ -89,13 +89,13 @@ def test_of_a_box_it_is_the_box(made: Path, folder: Path) -> None:
 
 
 def test_ctrl_c_keeps_the_volume_and_leaves_it_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    solve: Any = iterative.solve
+    solve: Any = iterative.solve_views
 
     def interrupted(*arguments: Any, **named: Any) -> Any:
         signal.raise_signal(signal.SIGINT)
         return solve(*arguments, **named)
 
-    monkeypatch.setattr("recon.error_bars.solve", interrupted)
+    monkeypatch.setattr("recon.error_bars.solve_views", interrupted)
     result = beamline(*FISTA, "-o", "out.h5")
     assert result.exit_code == 0, result.output
     assert "There are no error bars: their computation was stopped." in result.stderr
