@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, Mask, some_values
@@ -40,9 +41,7 @@ def plan_fill(mask: Mask) -> Fill:
     """
     if mask.all():
         raise ValueError(f"all {mask.size} pixels are masked or not finite: there is nothing to fill them from")
-    from scipy import ndimage  # here: help loads this module
-
-    ring = ndimage.distance_transform_cdt(mask, "chessboard")
+    ring = scipy.ndimage.distance_transform_cdt(mask, "chessboard")
     r, c = np.nonzero(mask)
     order = np.argsort(ring[r, c], kind="stable")
     return ring, r[order], c[order]
@@ -54,9 +53,7 @@ def areas(mask: Mask) -> Mask:
     Their fill values are guesses. A single pixel or a line is interpolated well.
     """
     full = np.pad(mask, 1, constant_values=True)
-    from scipy import ndimage
-
-    return np.asarray(ndimage.binary_opening(full, np.ones((3, 3)))[1:-1, 1:-1] & mask)
+    return np.asarray(scipy.ndimage.binary_opening(full, np.ones((3, 3)))[1:-1, 1:-1] & mask)
 
 
 def fill(image: Image, plan: Fill) -> None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from recon.base.arrays import F32, Mask, bin_views
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
-from recon.base.masks import masked
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +43,8 @@ class Views:
         Raises:
             ValueError: as `masked`.
         """
+        from recon.base.masks import masked  # here: help loads this module, and no scipy
+
         data, weights = masked(self.data, self.weights)
         return self if data is self.data and weights is self.weights else replace(self, data=data, weights=weights)
 

@@ -57,7 +57,8 @@ def refusal(*arguments: str) -> str:
 @pytest.mark.parametrize("name", [name for name, param in OPTIONS.items() if param.former])
 def test_the_name_of_the_last_version_is_understood_and_not_shown(name: str) -> None:
     now, before = (
-        recon.make_context("recon", ["no_scan.h5", words, TYPED.get(name, "b.h5")]) for words in (f"--{name}", OPTIONS[name].former)
+        recon.make_context("recon", ["no_scan.h5", words, TYPED.get(name, "b.h5")])
+        for words in (f"--{name}", OPTIONS[name].former)
     )
     assert now.params == before.params != recon.make_context("recon", ["no_scan.h5"]).params
     assert f"{OPTIONS[name].former} " not in now.get_help()
