@@ -62,20 +62,18 @@ def rotation_axis(
         by = correction
         if selection.axis_rows is not None:
             by = ScanCorrection(scan, replace(selection, rows=selection.axis_rows), lambda _: None, usable.frames)
-        axis_col, axis = _axis_beside_jumps(source, by, usable, warn, progress)
+        axis_col, axis = _axis_beside_jumps(by, usable, warn, progress)
     check_axis(source, axis_col)
     if selection.axis_col is not None and straight and usable.frames.size >= _FEWEST:
-        _compare_with_views(source, axis_col, correction, usable.frames, warn)
+        _compare_with_views(axis_col, correction, usable.frames, warn)
     return axis_col, axis
 
 
-def _compare_with_views(
-    source: ScanSource, given: float, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn
-) -> None:
+def _compare_with_views(given: float, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn) -> None:
     """Warn where some of the views clearly show another column than the one that was given."""
     with suppress(DataError):
         some = spread(frames, _COMPARED)
-        shown, estimate = locate_axis(source, correction.quiet(), some, lambda _: None, all_there=False)
+        shown, estimate = locate_axis(correction.quiet(), some, lambda _: None, all_there=False)
         if estimate.confident and abs(shown - given) > AGREE * correction.binning:
             warn(
                 f"The views show the rotation axis in column {shown:.2f}; column {given:g} was given. Columns are "
@@ -137,7 +135,6 @@ def _axis_by_views(
 
 
 def _axis_beside_jumps(
-    source: ScanSource,
     correction: ScanCorrection,
     usable: UsableViews,
     warn: Warn,
@@ -147,14 +144,13 @@ def _axis_beside_jumps(
     part = longest_part(usable.frames, usable.jumps)
     if part.size < usable.frames.size:
         with suppress(DataError):
-            located = locate_axis(source, correction, part, lambda _: None, progress)
+            located = locate_axis(correction, part, lambda _: None, progress)
             if located[1].confident:
                 return located
-    return locate_axis(source, correction, usable.frames, warn, progress)
+    return locate_axis(correction, usable.frames, warn, progress)
 
 
 def locate_axis(
-    source: ScanSource,
     correction: ScanCorrection,
     frames: NDArray[np.int64],
     warn: Warn,
@@ -172,7 +168,7 @@ def locate_axis(
         DataError: no axis in the search range explains the views.
     """
     height = (correction.rows.stop - correction.rows.start) // correction.binning
-    start = max(0, (height - _AXIS_ROWS) // 2)
+    start, source = max(0, (height - _AXIS_ROWS) // 2), correction.source
     frames = spread_views(source.table.angles[frames], _AXIS_VIEWS, frames)
     band = correction.at_once(frames, slice(start, min(height, start + _AXIS_ROWS)), progress)
     hidden = band.masked.all(axis=0)  # columns behind slits, which were filled: their noise has a long lever

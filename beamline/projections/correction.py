@@ -143,7 +143,7 @@ class ScanCorrection:
         """Survey the scan; arguments and errors are those of `survey`."""
         self.plan = survey(scan, selection, warn, views)
         self.rows, self.binning = selection.detector_rows, selection.binning
-        self._scan, self._source, self._selection = scan, scan.source, selection
+        self._scan, self.source, self._selection = scan, scan.source, selection
         references = None if self.plan.beam is None else self.plan.beam.references
         self._reader = ViewReader(scan, selection, self.plan.filters, references, warn)
         self._stream: CorrectionPlan | LinesPlan | None = None  # with the views fed so far
@@ -172,8 +172,8 @@ class ScanCorrection:
             self._reader.tell_unlit(frames, usable)
         if not (n := usable.size):
             raise self._reader.no_view()
-        with refused(self._source, self.plan.preparation):
-            order, at = _by_angle(self._source.table, usable), usable.astype(np.float64)
+        with refused(self.source, self.plan.preparation):
+            order, at = _by_angle(self.source.table, usable), usable.astype(np.float64)
             lines, _ = apply(
                 data, at, self.plan.of_rows(rows), usable, progress=lambda done: progress((n + done) // _STEPS, n),
                 order=order,
@@ -194,17 +194,17 @@ class ScanCorrection:
         """
         if self.plan.beam is not None and self.plan.beam.photons is not None:
             raise DataError(
-                f"{self._source.path}: --noise counts needs all views in memory. Give --noise log, or --bin "
+                f"{self.source.path}: --noise counts needs all views in memory. Give --noise log, or --bin "
                 f"{2 * self.binning}."
             )
-        in_time, frames = np.sort(frames), frames[_by_angle(self._source.table, frames)]
+        in_time, frames = np.sort(frames), frames[_by_angle(self.source.table, frames)]
         parts, kept = np.split(frames, np.arange(batch, frames.size, batch)), list[Projections]()
         passes = 1 if self.plan.beam is None else 2
 
         def done(parts: int, before: int) -> None:
             progress(before * frames.size + min(parts * batch, frames.size), passes * frames.size)
 
-        with refused(self._source, self.plan.preparation):
+        with refused(self.source, self.plan.preparation):
             plan = self.plan.of_rows(None)
             if isinstance(plan, CorrectionPlan):
                 parts, plan = self._with_air_found(parts, plan, lambda n: done(n, 0))
@@ -260,7 +260,7 @@ class ScanCorrection:
         data, usable = self._reader.read(frames, None)
         self._reader.tell_unlit(frames, usable)
         self._fed = np.append(self._fed, usable)
-        with refused(self._source, self.plan.preparation):
+        with refused(self.source, self.plan.preparation):
             lines, self._stream = self._next(data, usable, self._stream or self.plan.of_rows(None), last)
         if lines is None or not lines.view_ids.size:
             return None
@@ -287,7 +287,7 @@ class ScanCorrection:
         if self.plan.beam is None:
             return np.zeros((0, 0, 0), np.float32)
         flats = self._scan.used.flats[-1][:most]
-        exposures = float(np.median(self._source.table.exposures[flats])) / self._scan.usual_exposure
+        exposures = float(np.median(self.source.table.exposures[flats])) / self._scan.usual_exposure
         return self.quiet().at_once(flats).data * np.float32(math.sqrt(exposures) if exposures > 0 else 1.0)
 
     @property
@@ -296,16 +296,16 @@ class ScanCorrection:
         columns, or neighbours in angle that were not taken beside them.
         """
         finds_spots = np.isfinite(self.plan.preparation.zinger_threshold)
-        if finds_spots and (np.diff(_by_angle(self._source.table, self._fed)) != 1).any():
+        if finds_spots and (np.diff(_by_angle(self.source.table, self._fed)) != 1).any():
             return True
         if self.plan.beam is None or self._stream is None:
             return False
-        then, now = ((table.darks.size, table.flats.size) for table in (self._scan.table, self._source.table))
+        then, now = ((table.darks.size, table.flats.size) for table in (self._scan.table, self.source.table))
         return then != now or self._columns != {self._stream.air_columns}
 
     def finds_shadow(self, views: NDArray[np.int64]) -> bool:
         """Whether an object stands in the beam of these views of a finished scan that `feed` took for sample."""
-        shadow = None if self.plan.shadow is not None else self.plan.in_shadow(self._source, views).shadow
+        shadow = None if self.plan.shadow is not None else self.plan.in_shadow(self.source, views).shadow
         return shadow is not None and any(part.any() for part in shadow)
 
     def quiet(self) -> ScanCorrection:

@@ -30,7 +30,7 @@ from beamline.projections.scan_warnings import (
 from beamline.projections.selection import ScanSelection, Selection, choose_views
 from beamline.projections.tilt import warn_of_tilt
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, checked_views, evidence_of
+from beamline.projections.views import ViewGeometry, checked_views, evidence_request
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import I64
@@ -85,13 +85,13 @@ def prepare_projections(
     phases = phases or Phases()
     phases.enter("flags and references")
     selection = selection.of(source)
-    scan = evidence_of(source, selection)
+    scan = ScanEvidence(source, evidence_request(source, selection))
     usable, poses, wide = _usable(scan, selection, warn)
     phases.enter("tilt and references", "bands")
     selection, tilt = with_tilt(scan, selection, usable.frames, warn, phases.progress)
     correction = ScanCorrection(scan, selection, warn, usable.frames)
     if poses is None and selection.step(TiltAndLens).tilt is None and selection.cone is None:
-        warn_of_tilt(source, correction, usable.frames, warn, phases.progress)
+        warn_of_tilt(correction, usable.frames, warn, phases.progress)
     phases.enter("rotation axis")
     axis_col, axis = rotation_axis(scan, selection, correction, usable, poses, warn, phases.progress)
     warn_of_other_axis(poses, selection, axis_col, warn)
@@ -103,13 +103,13 @@ def prepare_projections(
     check(view_geometry.of(used))
     phases.enter("correction")
     used = np.union1d(used, wide) if buffer is None else used
-    projections = _corrected(source, correction, used, buffer, phases)
+    projections = _corrected(correction, used, buffer, phases)
     geometry = view_geometry.of(projections.view_ids)
     if estimated := _estimated(source, selection, projections, geometry):
         selection = selection.with_steps(*estimated)
         correction = ScanCorrection(scan, selection, lambda _: None, usable.frames)  # its warnings were given
         if any(step.on(source, selection)[0] is not None for step in estimated):
-            projections = _corrected(source, correction, used, buffer, phases)
+            projections = _corrected(correction, used, buffer, phases)
     light = compare_with_flats(scan, selection, projections, warn)
     phases.enter("background, rings, views held out, hardening", "corrections")
     place = view_geometry.axis_col, axis
@@ -148,7 +148,8 @@ def _with_held_out(
 
 def require_usable(source: ScanSource, selection: Selection) -> None:
     """Raise the errors of `prepare_projections` that can be found without reading a frame."""
-    _usable(evidence_of(source, selection), selection.of(source), lambda sentence: None)
+    scan = ScanEvidence(source, evidence_request(source, selection))
+    _usable(scan, selection.of(source), lambda sentence: None)
 
 
 def _usable(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> tuple[UsableViews, ScanPoses | None, I64]:
@@ -181,7 +182,6 @@ def _chosen(
 
 
 def _corrected(
-    source: ScanSource,
     correction: ScanCorrection,
     used: NDArray[np.int64],
     buffer: DiskBuffer | None,
@@ -192,11 +192,11 @@ def _corrected(
         projections = correction.at_once(used, progress=phases.progress)
     else:
         projections = correction.in_batches(used, buffer.views, buffer.batch, phases.progress)
-    if 2 * projections.view_ids.size < used.size:
+    if 2 * (n := projections.view_ids.size) < used.size:
         raise DataError(
-            f"{source.path}: only {projections.view_ids.size} of {used.size} views can be used; the others have no "
-            "light, no finite pixel, or not the pixels that were written. These are too few for the scan: choose "
-            "those that can be used with --views, or repeat the others."
+            f"{correction.source.path}: only {n} of {used.size} views can be used; the others have no light, "
+            "no finite pixel, or not the pixels that were written. These are too few for the scan: choose those that "
+            "can be used with --views, or repeat the others."
         )
     return projections
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from beamline.core.errors import DataError
 from beamline.core.sinks import Warn
 from beamline.projections.correction import ScanCorrection
-from beamline.storage.readers.base import ScanSource
 from recon.base.views import spread_views
 from recon.prep.axis_wedge import FEWEST_BANDS
 from recon.prep.tilt import TiltEstimate, find_tilt
@@ -24,9 +23,7 @@ _SURE = 3.0  # standard deviations from which a tilt is significant
 BandsDone = Callable[[int, int], None]  # (n, N): so many bands of rows are corrected, of so many
 
 
-def warn_of_tilt(
-    source: ScanSource, correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone
-) -> None:
+def warn_of_tilt(correction: ScanCorrection, frames: NDArray[np.int64], warn: Warn, progress: BandsDone) -> None:
     """Warn if the corrected rows of a parallel beam show a significant tilt.
 
     Args:
@@ -35,9 +32,9 @@ def warn_of_tilt(
     rows = (correction.rows.stop - correction.rows.start) // correction.binning
     if rows < _FEWEST_ROWS:
         return
-    frames = spread_views(source.table.angles[frames], _VIEWS, frames)
+    frames = spread_views(correction.source.table.angles[frames], _VIEWS, frames)
     try:
-        shown = shown_tilt(source, correction, frames, (_BANDS, _BAND_ROWS), progress)
+        shown = shown_tilt(correction, frames, (_BANDS, _BAND_ROWS), progress)
     except (ValueError, DataError):
         return  # nothing is known, and nothing was asked
     if abs(shown.tilt) * rows > MATTERS and abs(shown.tilt) > _SURE * shown.uncertainty:
@@ -49,7 +46,6 @@ def warn_of_tilt(
 
 
 def shown_tilt(
-    source: ScanSource,
     correction: ScanCorrection,
     frames: NDArray[np.int64],
     size: tuple[int, int],
@@ -82,7 +78,7 @@ def shown_tilt(
     progress(bands, bands)
     if len(means) < FEWEST_BANDS:
         raise ValueError(f"{len(means)} bands of rows; at least {FEWEST_BANDS} are needed")
-    return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), source.table.angles[ids])
+    return find_tilt(np.stack(means, axis=1), np.array(heights) - np.mean(heights), correction.source.table.angles[ids])
 
 
 def tilt_text(tilt: float, uncertainty: float) -> str:

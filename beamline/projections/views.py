@@ -121,11 +121,11 @@ class ViewGeometry:
 _OF_A_CIRCLE = angles_shown.ORDER, "axis"  # rules on what vectors of each view take the place of
 
 
-def evidence_of(source: ScanSource, selection: Selection) -> ScanEvidence:
-    """The evidence of a scan for a reconstruction of `selection`; the monitor looks at its frames where that asks."""
+def evidence_request(source: ScanSource, selection: Selection) -> EvidenceRequest:
+    """What a reconstruction of `selection` asks of the evidence; the monitor looks at the frames where that asks."""
     asked = selection.step(Preparation)
     judged = judged_flags(source) if asked.judged and source.finished else None
-    return ScanEvidence(source, EvidenceRequest(asked.accepted, selection.cone, judged))
+    return EvidenceRequest(asked.accepted, selection.cone, judged)
 
 
 def checked_views(scan: ScanEvidence, selection: ScanSelection, warn: Warn) -> UsableViews:

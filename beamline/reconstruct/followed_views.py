@@ -158,7 +158,7 @@ class AxisSearch:
         last_chance = ended and self.col is None
         warn = self._warn if last_chance else lambda sentence: None  # the axis will be searched again
         try:
-            axis_col, estimate = locate_axis(self._source, correction, views, warn, all_there=ended)
+            axis_col, estimate = locate_axis(correction, views, warn, all_there=ended)
         except DataError:  # the views do not cover enough angles yet
             if last_chance:
                 raise

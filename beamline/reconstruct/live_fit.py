@@ -30,12 +30,13 @@ from beamline.projections.registry import in_order
 from beamline.projections.selection import check_axis
 from beamline.projections.step import StepDone
 from beamline.projections.usable_views import UsableViews
-from beamline.projections.views import ViewGeometry, checked_views, evidence_of, refuse
+from beamline.projections.views import ViewGeometry, checked_views, evidence_request, refuse
 from beamline.reconstruct.followed_views import AxisSearch, Cursor, FollowedViews, FollowState, PassLaws
 from beamline.reconstruct.job import corrections_done, progress_events
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.snapshots import LiveSlices, Snapshots
 from beamline.storage.readers.base import ScanSource
+from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import BEFORE_VIEWS, findings_of
 from drivers.base.clock import Clock
 from recon.base.method import Progress
@@ -72,7 +73,7 @@ class ScanFollower:
         self.views, self._cursor = FollowedViews(source, self._selection), Cursor()
         self._references_follow = False  # darks or flats come after the views
         self._axis = AxisSearch(source, self._selection, warn)
-        self._scan = evidence_of(source, self._selection)
+        self._scan = ScanEvidence(source, evidence_request(source, self._selection))
         self._correction: ScanCorrection | None = None  # None: waits for references
         self._fit: StreamingFit | None = None
         self._history: list[Progress] = []

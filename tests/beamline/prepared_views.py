@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 from beamline.projections.prepare import DiskBuffer, prepare_projections
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
+from beamline.projections.views import evidence_request
+from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.open import SourceOptions
+from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.geometry import Geometry
 from recon.prep.projections import Projections
 
@@ -25,6 +28,11 @@ def prepare(
     with ExitStack() as until:
         source = until.enter_context(SourceOptions(scan, **opened).open()) if isinstance(scan, Path) else scan
         return prepare_projections(source, selection, told.append, buffer), told
+
+
+def evidence_of(source: ScanSource, selection: Selection) -> ScanEvidence:
+    """The evidence of a scan as a reconstruction of `selection` takes it."""
+    return ScanEvidence(source, evidence_request(source, selection))
 
 
 def prepared_views(

@@ -226,9 +226,7 @@ def _refined(
         levelled = ScanCorrection(
             scan, plain.with_steps(replace(step, tilt=math.degrees(tilt))), lambda _: None, frames
         )  # fmt: skip
-        residual = shown_tilt(
-            scan.source, levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress)
-        )
+        residual = shown_tilt(levelled, frames, (_BANDS, _BAND_ROWS), _from(n * _BANDS, _ROUNDS * _BANDS, progress))
         tilt += residual.tilt
         if abs(residual.tilt) < residual.uncertainty / 4 or abs(residual.tilt) * rows < _NOTHING / 2:
             break

@@ -14,11 +14,11 @@ from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.selection import Selection
-from beamline.projections.views import evidence_of
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.light import references_usable
 from recon.prep.projections import merge_and_empty
 from tests.beamline.array_source import ArraySource, counted, scan_of
+from tests.beamline.prepared_views import evidence_of
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
 from tests.slow_cases import others_slow
 

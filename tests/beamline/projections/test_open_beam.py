@@ -16,11 +16,10 @@ from beamline.projections.open_beam import OpenBeam
 from beamline.projections.prepared import hold_out
 from beamline.projections.protocols import PrepStep
 from beamline.projections.selection import Selection
-from beamline.projections.views import evidence_of
 from recon.base.choices import Noise
 from recon.prep.counts import Counts, line_integrals
 from tests.beamline.array_source import ArraySource, scan_of
-from tests.beamline.prepared_views import prepare
+from tests.beamline.prepared_views import evidence_of, prepare
 from tests.beamline.scans import TwoCylinders
 
 SCAN = TwoCylinders(shape=(16, 64), axis_col=31.7)

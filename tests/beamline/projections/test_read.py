@@ -11,8 +11,8 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.references import read_references
 from beamline.projections.read import read_binned
 from beamline.projections.selection import Selection
-from beamline.projections.views import evidence_of
 from tests.beamline.array_source import ArraySource
+from tests.beamline.prepared_views import evidence_of
 
 
 @pytest.mark.parametrize("binning", [1, 2])

@@ -12,10 +12,9 @@ from beamline.projections.correction import ScanCorrection
 from beamline.projections.corrections.air import Air
 from beamline.projections.prepare import DiskBuffer
 from beamline.projections.selection import Selection
-from beamline.projections.views import evidence_of
 from drivers.base.frame import FrameKind
 from tests.beamline.array_source import ArraySource, counted
-from tests.beamline.prepared_views import prepare
+from tests.beamline.prepared_views import evidence_of, prepare
 from tests.beamline.projections.replaced import ANGLES, AXIS, SHAPE, VIEWS, Blocks, line_integrals
 from tests.beamline.scans import DARK, TwoCylinders
 

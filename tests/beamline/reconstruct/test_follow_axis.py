@@ -60,7 +60,7 @@ def test_a_post_that_shows_itself_at_the_end_does_not_draw_the_axis_away(tmp_pat
 
 @pytest.mark.slow
 def test_a_better_axis_begins_the_fit_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def locate(source: object, corrector: object, frames: np.ndarray, *_: object, **__: object) -> Any:
+    def locate(corrector: object, frames: np.ndarray, *_: object, **__: object) -> Any:
         value = 18.0 if frames.size < 20 else 20.7
         return value, AxisEstimate(value, np.arange(3.0), np.arange(3.0), True, "pair")
 
@@ -90,7 +90,7 @@ def test_the_axis_is_looked_for_at_half_a_turn_and_what_is_unknown_till_then_is_
         table=SimpleNamespace(angles=np.radians(np.arange(0, 360, 1.8))), axis_col=None, cone=None
     )
 
-    def locate(source: Any, correction: object, frames: np.ndarray, *_: object, **__: object) -> Any:
+    def locate(correction: object, frames: np.ndarray, *_: object, **__: object) -> Any:
         looks.append(frames.size)
         sure = source.table.angles[frames[-1]] > np.radians(175)
         return 20.7, AxisEstimate(20.7, np.arange(3.0), np.arange(3.0), sure, "ends of half a turn")

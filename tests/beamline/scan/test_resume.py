@@ -24,7 +24,7 @@ from beamline.projections.corrections.air import Air
 from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.prepare import prepare_projections
 from beamline.projections.selection import Selection
-from beamline.projections.views import checked_views, evidence_of
+from beamline.projections.views import checked_views
 from beamline.scan import control
 from beamline.scan.control import State, Verb, running, tell
 from beamline.scan.resume import open_for_resume
@@ -37,6 +37,7 @@ from beamline.storage.writer_lock import WriterLock
 from beamline.storage.writers import layout
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults, assert_true
+from tests.beamline.prepared_views import evidence_of
 from tests.beamline.ran import Ran, ended_run, small
 
 FIRST = 5  # 3 darks and 2 flats

@@ -15,13 +15,12 @@ from beamline.projections.corrections.preparation import Preparation
 from beamline.projections.corrections.resampling import TiltAndLens
 from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
-from beamline.projections.views import evidence_of
 from recon.assess.metrics import psnr
 from recon.base.volume import Grid
 from recon.prep.resample import Distortion
 from recon.voxels.fbp import fbp
 from tests.beamline.array_source import ArraySource, counted
-from tests.beamline.prepared_views import prepare
+from tests.beamline.prepared_views import evidence_of, prepare
 from tests.beamline.scans import BEAM, DARK
 from tests.recon.prep.balls import Balls
 

@@ -14,10 +14,11 @@ import pytest
 from beamline.core.errors import DataError
 from beamline.features.files.validate import describe, validate
 from beamline.projections.selection import Selection
-from beamline.projections.views import checked_views, evidence_of
+from beamline.projections.views import checked_views
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.fields import EXCHANGE, NXTOMO, Entry
 from beamline.storage.readers.open import SourceOptions, open_scan
+from tests.beamline.prepared_views import evidence_of
 from tests.beamline.storage.readers.foreign_scans import (
     COLS,
     CONE,

@@ -17,9 +17,10 @@ from beamline.core.errors import DataError
 from beamline.core.sinks import Note
 from beamline.features.files.validate import describe, validate
 from beamline.projections.selection import Selection
-from beamline.projections.views import checked_views, evidence_of
+from beamline.projections.views import checked_views
 from beamline.storage.readers.open import SourceOptions, open_scan
 from beamline.storage.rules.stored_order import SINOGRAM
+from tests.beamline.prepared_views import evidence_of
 
 VIEWS = np.arange(5 * 3 * 4, dtype=np.float32).reshape(5, 3, 4)
 NAMES = ("view", "row", "col")

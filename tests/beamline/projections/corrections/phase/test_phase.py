@@ -17,10 +17,10 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.protocols import ScanPart
 from beamline.projections.selection import Selection
 from beamline.projections.step import NamedStep
-from beamline.projections.views import evidence_of
 from recon.features.phase import FilterLength
 from recon.prep.projections import Projections, merge_and_empty
 from tests.beamline.array_source import ArraySource, counted
+from tests.beamline.prepared_views import evidence_of
 from tests.beamline.projections.corrections.test_memory import peak
 from tests.beamline.scans import BEAM, DARK
 from tests.recon.prep.rims import views_of_can
