@@ -15,7 +15,7 @@ from beamline.projections.prepared import PreparedProjections
 from beamline.projections.selection import Selection
 from beamline.storage.readers.open import open_scan
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.slow]
 SHAPE, VIEWS = (40, 56), 45
 SCENE = """
 phantom:
@@ -50,7 +50,9 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @cache
 def _prepared(path: Path, model: str = "auto", buffer: DiskBuffer | None = None) -> PreparedProjections:
     with open_scan(path) as source:
-        return prepare_projections(source, Selection(axis_col=27.5, steps=(Air(model),)), lambda said: None, buffer)
+        return prepare_projections(
+            source, Selection(axis_col=27.5, steps=(Air(model),)), lambda said: None, buffer
+        )
 
 
 def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:
@@ -73,7 +75,6 @@ def test_views_of_a_bent_beam_become_those_of_a_straight_one(scans: dict[str, Pa
     assert np.abs(as_it_was.mean(axis=0)).max() > 0.04
 
 
-@pytest.mark.slow
 def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict[str, Path], tmp_path: Path) -> None:
     said, record = _recon(scans["bent"], tmp_path / "v.h5", "-m", "fbp")
     assert "Background of the beam: the air of the views is a surface" in said and record in said
@@ -83,7 +84,6 @@ def test_the_terminal_the_report_and_the_file_say_what_was_taken_off(scans: dict
     assert "Background" not in said and record == "no surface taken off, a line through the air at the edges"
 
 
-@pytest.mark.slow
 def test_slabs_share_the_surface_of_the_whole_to_the_bit(scans: dict[str, Path]) -> None:
     whole = _prepared(scans["bent"])
     buffer = DiskBuffer(np.empty((VIEWS, *SHAPE), np.float32), 7)

@@ -5,7 +5,7 @@ docs/faults.md has a row for each of these, with the same names; `test_page` kee
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -103,6 +103,13 @@ LINE: tuple[LineFault, ...] = (
         },
     ),
 )
+
+
+def phases_of(kind: str, phases: Sequence[Phase]) -> Sequence[Phase]:
+    """Those of the phases in which a fault is tried on a controller: on the first in each, the others share them."""
+    n = list(KINDS).index(kind)
+    return phases if n == 0 or len(phases) == 1 else phases[n - 1 :: len(KINDS) - 1]
+
 
 UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"
 """In each phase with the next request, and while the stage turns and nobody asks it. The words of the error."""

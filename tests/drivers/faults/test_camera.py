@@ -23,6 +23,7 @@ from tests.drivers.faults.aftermath import (
     assert_speaks,
 )
 from tests.drivers.faults.rig import DARKS, VIEWS, Rig, Scanned
+from tests.slow_cases import others_slow
 
 RigOf = Callable[..., Rig]
 ROWS = {row.fault: row for row in table.CAMERA}
@@ -88,7 +89,7 @@ def calls_of_a_scan(library: Path, tmp_path_factory: pytest.TempPathFactory) -> 
         return {call: world.calls(call) - before[0][call] for call in CALLS}
 
 
-@pytest.mark.parametrize("call", CALLS)
+@pytest.mark.parametrize("call", others_slow(CALLS, 6))
 def test_an_error_of_the_library(rig: Rig, call: str, calls_of_a_scan: dict[str, int], tmp_path: Path) -> None:
     """Of one call the first of a scan, of the next a middle one, of the third the last (the driver's own tests let each
     fail): the scan ends with that error; or, where it came while frames were waited for, it is reported and nothing is

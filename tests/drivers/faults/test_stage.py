@@ -19,11 +19,12 @@ from tests.drivers.faults.aftermath import (
     assert_speaks,
 )
 from tests.drivers.faults.rig import KINDS, VIEWS, Rig
+from tests.slow_cases import others_slow
 
 RigOf = Callable[[str], Rig]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", others_slow(KINDS))
 @pytest.mark.parametrize("row", table.MOTION, ids=lambda row: row.fault)
 def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: str, tmp_path: Path) -> None:
     """The views before it are in the file; no view is called missing, for it was never reached."""

@@ -20,6 +20,7 @@ from tests.drivers import pm16c_rig, zaber_rig
 from tests.drivers.fuzz import FuzzedWire, Pieces, allowed, plans
 from tests.drivers.stages import pi_gcs_rig
 from tests.drivers.stages.rig import NAMES, StageRig
+from tests.slow_cases import others_slow
 
 TIMEOUT = 0.2
 LONG = 2.0
@@ -133,7 +134,7 @@ def opened(rig: StageRig, wire: FuzzedWire) -> RotationStage | DeviceError:
     return allowed(lambda: rig.open(timeout=TIMEOUT), rig.clock, WITHIN)
 
 
-@pytest.mark.parametrize("kind", FUZZED)
+@pytest.mark.parametrize("kind", others_slow(FUZZED))
 @given(data=st.data())
 def test_fuzz_opening_opens_or_says_why(kind: str, data: st.DataObject) -> None:
     """And once the line is sound it opens."""
@@ -150,7 +151,7 @@ def test_fuzz_opening_opens_or_says_why(kind: str, data: st.DataObject) -> None:
     stage.close()
 
 
-@pytest.mark.parametrize("kind", FUZZED)
+@pytest.mark.parametrize("kind", others_slow(FUZZED))
 @given(data=st.data(), calls=st.lists(st.sampled_from(CALLS), min_size=1, max_size=8))
 def test_fuzz_every_call_ends_in_time_and_the_stage_can_be_used_again(
     kind: str, data: st.DataObject, calls: list[Call]

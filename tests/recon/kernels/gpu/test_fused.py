@@ -19,7 +19,7 @@ from recon.splatting.problem import FitProblem
 from recon.splatting.settings import NAMES, FitSettings
 from tests.recon.kernels.gpu.on_gpu import UNIT
 
-fused = importlib.import_module("recon.kernels.gpu.engine")
+fused, tiles = (importlib.import_module(f"recon.kernels.gpu.{name}") for name in ("engine", "tiles"))
 SETTINGS = FitSettings(policy=None, tv_size=5, tv_weight=0.05, views_per_step=2)
 
 
@@ -27,12 +27,16 @@ def _fused(state: fit.FitState) -> Any:
     return state.fused
 
 
-def _start(side: int = 24, n: int = 60, wide: float = 0.5) -> tuple[fit.FitState, FitProblem]:
+def _start(shape: tuple[int, int] = (8, 24), n: int = 16, wide: float = 0.5) -> tuple[fit.FitState, FitProblem]:
     rng, backend = np.random.default_rng(3), backend_for("cuda")
-    geometry = Geometry.parallel(np.linspace(0, np.pi, 7, endpoint=False), (side, side))
-    data = rng.random((7, side, side)).astype(np.float32)
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 7, endpoint=False), shape)
+    data = rng.random((7, *shape)).astype(np.float32)
+    rows, cols = shape
     model = Gaussians.from_physical(
-        (rng.random((n, 3)) - 0.5) * 0.8 * side, np.full((n, 3), wide), rng.uniform(0.2, 1, n), density_unit=UNIT
+        (rng.random((n, 3)) - 0.5) * 0.8 * np.array([cols, cols, rows]),
+        np.full((n, 3), wide),
+        rng.uniform(0.2, 1, n),
+        density_unit=UNIT,
     )
     problem = fit.problem_of(Views(data, geometry), Grid.matching(geometry), UNIT, SETTINGS, backend)
     return fit.init(model, 4, backend=backend), problem
@@ -44,7 +48,8 @@ def _arrays(state: fit.FitState) -> list[np.ndarray]:
     return [*(group[name].cpu().numpy() for group in groups for name in NAMES), state.statistic.cpu().numpy()]
 
 
-def test_steps_whose_lists_were_too_short_are_repeated() -> None:
+def test_steps_whose_lists_were_too_short_are_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiles, "_BLOCK", 32)  # so that few Gaussians fill a list
     found = []
     for settled in (True, False):  # settled: each step has long enough lists before the next one is queued
         state, problem = _start()
@@ -71,7 +76,7 @@ def test_a_graph_gives_the_bits_of_its_launches(monkeypatch: pytest.MonkeyPatch)
     found = []
     for launched in (False, True):
         monkeypatch.setattr(fused, "interpreted", lambda launched=launched: launched)
-        state, problem = _start(side=96, n=3000, wide=1.5)
+        state, problem = _start((96, 96), n=3000, wide=1.5)
         for _ in range(300):
             fit.step(state, problem, SETTINGS, 0.5)
         found.append((_arrays(state), float(state.loss), float(state.residual)))
