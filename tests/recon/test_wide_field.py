@@ -109,7 +109,7 @@ def test_the_axis_of_a_half_acquisition_is_found_with_little_overlap(overlap: fl
     assert estimate.confident
 
 
-@pytest.mark.parametrize("overlap", others_slow([0.01, 0.03, 0.02, 0.05], 2))
+@pytest.mark.parametrize("overlap", others_slow([0.01, 0.03, 0.02, 0.05]))
 @pytest.mark.parametrize("photons", [30.0, 300.0])
 def test_an_axis_that_noise_hides_is_not_called_certain(overlap: float, photons: float) -> None:
     for seed in range(2):

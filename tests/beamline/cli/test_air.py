@@ -50,9 +50,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 @cache
 def _prepared(path: Path, model: str = "auto", buffer: DiskBuffer | None = None) -> PreparedProjections:
     with open_scan(path) as source:
-        return prepare_projections(
-            source, Selection(axis_col=27.5, steps=(Air(model),)), lambda said: None, buffer
-        )
+        return prepare_projections(source, Selection(axis_col=27.5, steps=(Air(model),)), lambda said: None, buffer)
 
 
 def _recon(scan: Path, output: Path, *options: str) -> tuple[str, str]:

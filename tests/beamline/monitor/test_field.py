@@ -135,11 +135,12 @@ NO_CHANGE: dict[str, Callable[[Any], list[Frame]]] = {
 }
 
 
-@pytest.mark.parametrize("frames", NO_CHANGE.values(), ids=NO_CHANGE)
+@pytest.mark.parametrize("frames", others_slow(NO_CHANGE.values(), 2), ids=NO_CHANGE)
 def test_no_mass_entered_or_left(fake: Any, frames: Callable[[Any], list[Frame]]) -> None:
     assert fake.of("mass", frames(fake)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lost", others_slow([0.09, 0.3], 1))
 def test_thin_matter_that_passes_the_edges_is_no_mass_that_left_while_the_beam_weakens(fake: Any, lost: float) -> None:
     beside = (*SAMPLE, (0.0, 41.0, 5.0, 0.006), (0.0, -41.0, 5.0, 0.006))  # in both edges at 90°

@@ -9,6 +9,7 @@ from beamline.monitor.check import Flag, Level
 from beamline.monitor.checks import CHECKS
 from beamline.monitor.motion import MotionCheck
 from tests.beamline.monitor.blobs import BLOCK, Blobs
+from tests.slow_cases import others_slow
 
 
 def of_motion(scan: Blobs) -> list[Flag]:
@@ -63,7 +64,7 @@ def shaking(
     return scan.flags(SPOTLESS, step=step)
 
 
-@pytest.mark.parametrize(("across", "down", "seed"), [(0.4, 0.9, 0), (1.3, 0.35, 2)])
+@pytest.mark.parametrize(("across", "down", "seed"), others_slow([(0.4, 0.9, 0), (1.3, 0.35, 2)]))
 def test_a_shake_is_named_with_its_size_and_a_way_that_exists(across: float, down: float, seed: int) -> None:
     flags = [flag for flag in shaking(across, down, seed=seed) if flag.level is not Level.INFO]
     assert [(flag.check, flag.level) for flag in flags] == [("motion", Level.WARN)]
@@ -72,7 +73,7 @@ def test_a_shake_is_named_with_its_size_and_a_way_that_exists(across: float, dow
     assert "`beamline recon --calibrate shifts`" in flags[0].advice
 
 
-@pytest.mark.parametrize(("seed", "step", "creep"), [(0, 0.004, 0.0), (2, 0.03, -0.1)])
+@pytest.mark.parametrize(("seed", "step", "creep"), others_slow([(0, 0.004, 0.0), (2, 0.03, -0.1)]))
 def test_a_sample_that_turns_and_creeps_does_not_shake(seed: int, step: float, creep: float) -> None:
     assert not [flag for flag in shaking(0, 0, seed=seed, creep=creep, step=step) if "shakes" in flag.advice]
 

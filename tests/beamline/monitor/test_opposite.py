@@ -12,6 +12,7 @@ from beamline.monitor.opposite import OppositeCheck
 from beamline.plan.plan import interlaced
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.monitor.blobs import BLOCK, COLS, Blobs
+from tests.slow_cases import others_slow
 
 STEP = np.radians(2)
 MIDDLE = (COLS * BLOCK - 1) / 2
@@ -39,6 +40,7 @@ def only(scan: Blobs, **known: object) -> list[Flag]:
     return scan.flags([OppositeCheck()], **known)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [6.8])
 def test_the_axis_of_a_sample_that_only_turns_is_found_and_said_where_it_is_stated_elsewhere(axis: float) -> None:
     scan = Moved(100, lambda view: (0, axis))
@@ -114,7 +116,7 @@ def test_a_wide_sample_in_passes_raises_no_flag_while_its_neighbours_are_far_and
     assert [flag.score for flag in flags] == pytest.approx([6] * len(flags), abs=0.5)
 
 
-@pytest.mark.parametrize("jump", [0, 6])
+@pytest.mark.parametrize("jump", others_slow([0, 6]))
 def test_a_far_step_still_shows_a_jump_that_is_larger_than_what_it_may_miss(jump: int) -> None:
     """Half a turn in one pass: the first view is compared with the last one, a step before it on the other side."""
     flags = only(Wide(np.arange(200) * np.pi / 200, lambda view: (jump * (view >= 100), 0)))

@@ -10,6 +10,7 @@ from beamline.monitor.check import Level
 from beamline.monitor.watch import usual_step
 from drivers.base.frame import Frame, FrameKind
 from tests.beamline.monitor.conftest import STEP
+from tests.slow_cases import others_slow
 
 FIRST = 10  # the row of view 0
 Discs = tuple[tuple[float, ...], ...]
@@ -26,12 +27,15 @@ def black(frame: Frame, first: int = 20, n: int = 4) -> Frame:
 
 @pytest.mark.parametrize(
     ("discs", "views"),
-    [
-        (ROD, [79, 40, 20, 10]),
-        (ROD, [2, 3, 4, 5, 6, 7]),
-        (EVEN, range(2, 70, 6)),  # at even steps that are none of the scan
-        (NARROW, [2, 30, 60]),
-    ],
+    others_slow(
+        [
+            (ROD, [79, 40, 20, 10]),
+            (ROD, [2, 3, 4, 5, 6, 7]),
+            (EVEN, range(2, 70, 6)),  # at even steps that are none of the scan
+            (NARROW, [2, 30, 60]),
+        ],
+        2,
+    ),
 )
 def test_views_taken_again_raise_no_alarm(fake: Any, discs: Discs, views: Sequence[int]) -> None:
     frames = fake.references() + fake.views(80, discs=discs) + fake.again(views, FIRST, discs=discs)

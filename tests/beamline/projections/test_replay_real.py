@@ -91,6 +91,7 @@ def band(view: int, row: NDArray[np.float64], col: NDArray[np.float64]) -> Any:
     return np.where((row >= 50) & (row < 54) & (40 <= view < 45), 0.0, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "check"), others_slow([(crumb, "floater"), (fog, "ghost"), (band, "bands")]))
 def test_what_is_put_into_a_real_scan_is_found(shared_data: Path, share: Share, check: str) -> None:
     own = {(flag.check, flag.frames) for flag in flags(shared_data / DIAMOND)}

@@ -15,6 +15,7 @@ from recon.voxels.fbp import fbp
 from recon.voxels.field_edges import FieldEdges
 from tests.beamline.array_source import ArraySource, scan_of
 from tests.beamline.prepared_views import prepare
+from tests.slow_cases import others_slow
 
 VIEWS, SHAPE, MU = 90, (4, 64), 0.004
 ANGLES = np.linspace(0, np.pi, VIEWS, endpoint=False)
@@ -35,7 +36,7 @@ def scan(radius: float, light: np.ndarray | float = 1.0, beside: float = 0.0) ->
     return scan_of(darks, flats, views, ANGLES)
 
 
-@pytest.mark.parametrize("radius", [45.0, 90.0, 180.0])
+@pytest.mark.parametrize("radius", others_slow([45.0, 90.0, 180.0]))
 def test_a_sample_wider_than_the_field_keeps_its_density_and_is_named(radius: float) -> None:
     found, (line,) = prepare(scan(radius), SELECTION)
     assert found.projections.air_columns == (0, 0)
@@ -61,6 +62,7 @@ def test_that_fbp_continues_the_views_is_said_where_it_does() -> None:
     assert "FBP continues the views, with" in line and "The edge columns are not used as air" in line
 
 
+@pytest.mark.slow
 def test_a_sample_beside_the_axis_that_leaves_the_field_and_comes_back_is_named_with_its_views() -> None:
     _, told = prepare(scan(28.0, beside=15.0), SELECTION)
     (line,) = (line for line in told if "leaves the field" in line)  # a disc's views are mirror images, too
@@ -74,7 +76,7 @@ def test_a_sample_beside_the_axis_that_leaves_the_field_and_comes_back_is_named_
 
 @pytest.mark.parametrize(
     ("radius", "ring_current", "of_current"),
-    [(90.0, "ignore", [True]), (90.0, "use", []), (20.0, "ignore", [])],
+    others_slow([(90.0, "ignore", [True]), (90.0, "use", []), (20.0, "ignore", [])]),
     ids=["nothing corrects it", "corrected", "corrected by the air"],
 )
 def test_a_ring_current_that_nothing_corrects_is_told(radius: float, ring_current: str, of_current: list[bool]) -> None:
@@ -85,7 +87,9 @@ def test_a_ring_current_that_nothing_corrects_is_told(radius: float, ring_curren
     assert ["varies from 150 to 200, 33%" in line for line in told if "ring current" in line] == of_current
 
 
-@pytest.mark.parametrize("light", [1.0, 0.5], ids=["matter at the edges", "flats so dark that edges are near 0"])
+@pytest.mark.parametrize(
+    "light", others_slow([1.0, 0.5]), ids=["matter at the edges", "flats so dark that edges are near 0"]
+)
 def test_what_flats_of_more_light_do_is_told_where_no_column_shows_air(light: float) -> None:
     as_taken, told = prepare(scan(120.0, 1.8 * light), SELECTION)
     mean = as_taken.projections.data.mean()
@@ -99,7 +103,7 @@ def test_what_flats_of_more_light_do_is_told_where_no_column_shows_air(light: fl
 
 
 @pytest.mark.parametrize(
-    "light", [0.68, 1.2, *(np.linspace(1, end, VIEWS)[:, None, None] for end in (0.6, 1.3))], ids=str
+    "light", others_slow([0.68, 1.2, *(np.linspace(1, end, VIEWS)[:, None, None] for end in (0.6, 1.3))]), ids=str
 )
 def test_a_beam_that_is_not_that_of_its_flats_is_levelled_by_its_air(light: np.ndarray | float) -> None:
     """As of Diamond's scan, whose one flat is brighter than the open beam; its air is no thinner at the edges."""

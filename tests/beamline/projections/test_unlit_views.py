@@ -30,6 +30,7 @@ def scan(unlit: list[int], value: float | None, scale: float = 1.0) -> ArraySour
     return blocks.source()
 
 
+@pytest.mark.slow
 @given(
     st.lists(st.integers(0, VIEWS - 1), min_size=1, max_size=VIEWS // 2, unique=True),
     st.sampled_from((None, 0.0, 65535.0, 100.0)),

@@ -18,6 +18,7 @@ from beamline.projections.selection import Selection
 from beamline.storage.readers.open import SourceOptions
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import BEAM, DARK, TwoCylinders
+from tests.slow_cases import others_slow
 
 SCAN = TwoCylinders()
 REFERENCES = [np.full((3, *SCAN.shape), level, np.uint16) for level in (DARK, DARK + BEAM)]
@@ -71,7 +72,7 @@ def _spoil(path: Path, places: list[int]) -> None:
             file.write(b"\xaa" * 16)
 
 
-@pytest.mark.parametrize(("write", "flags"), [(nxtomo, "use"), (exchange, "ignore"), (series, "use")])
+@pytest.mark.parametrize(("write", "flags"), others_slow([(nxtomo, "use"), (exchange, "ignore"), (series, "use")]))
 def test_views_and_references_that_cannot_be_read_are_left_out_and_named(
     tmp_path: Path, write: object, flags: str
 ) -> None:

@@ -18,6 +18,7 @@ from beamline.projections.usable_views import WARNED_WEIGHT
 from beamline.storage.rules.flag_policy import FEWEST_VIEWS
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+from tests.slow_cases import others_slow
 
 SCAN = TwoCylinders(angles=np.radians(np.arange(0, 180, 6.0)), shape=(2, 40))
 SELECTION = Selection(axis_col=SCAN.axis_col, steps=(Air("none"),))
@@ -66,7 +67,7 @@ def test_flags_may_be_ignored(tmp_path: Path) -> None:
     assert told[0] == "--flags ignore: 6 views with an alarm and 2 with a warning are used as they are."
 
 
-@pytest.mark.parametrize("n", [FEWEST_VIEWS, FEWEST_VIEWS - 1, 0])
+@pytest.mark.parametrize("n", others_slow([FEWEST_VIEWS, FEWEST_VIEWS - 1, 0], 2))
 def test_too_few_good_views_are_refused_with_figures(tmp_path: Path, n: int) -> None:
     path = scan(tmp_path, {FIRST + i: Level.ALARM for i in range(n, 30)})
     if n >= FEWEST_VIEWS:

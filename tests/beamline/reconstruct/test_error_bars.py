@@ -88,6 +88,7 @@ def test_of_a_box_it_is_the_box(made: Path, folder: Path) -> None:
     assert np.abs(box - whole[20:30, 4:20, 6:22]).mean() < 0.05 * whole.mean()
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_the_volume_and_leaves_it_out(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     solve: Any = iterative.solve_views
 

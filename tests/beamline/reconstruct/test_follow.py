@@ -40,6 +40,7 @@ from tests.beamline.reconstruct.growing_scan import (
     schedule,
 )
 from tests.beamline.scans import frames_of
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -101,11 +102,14 @@ def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("seconds", "told"),
-    [
-        (1.5, ""),  # seven views
-        (3.0, "Stopped while the scan was running: the volume shows the first {} views."),
-        (np.inf, "Stopped: the volume is reconstructed from the first {} of 30 views."),
-    ],
+    others_slow(
+        [
+            (1.5, ""),  # seven views
+            (3.0, "Stopped while the scan was running: the volume shows the first {} views."),
+            (np.inf, "Stopped: the volume is reconstructed from the first {} of 30 views."),
+        ],
+        2,
+    ),
 )
 def test_a_stop_delivers_the_views_so_far_if_they_make_a_volume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float, told: str

@@ -24,6 +24,7 @@ from recon.base.volume import Grid
 from recon.voxels.projector import Projector
 from tests.beamline.prepared_views import prepare
 from tests.beamline.scans import TwoCylinders, write_exchange
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -50,7 +51,7 @@ def _written(made: Reconstruction, scan: Scan, output: Path) -> tuple[Any, list[
     return events[-1].data, [str(event.data.get("message")) for event in events]
 
 
-@pytest.mark.parametrize(("turn", "compared"), [(3.6, True), (2.8, False)])
+@pytest.mark.parametrize(("turn", "compared"), others_slow([(3.6, True), (2.8, False)]))
 def test_a_cones_volume_is_compared_with_fdk_where_there_is_one(
     scan: Scan, tmp_path: Path, turn: float, compared: bool
 ) -> None:

@@ -69,6 +69,7 @@ def test_voxels_and_places_are_those_of_the_whole_volume(
     assert part.parameters["axis_col"] == every.parameters["axis_col"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("folder")
 def test_the_box_around_the_sample_is_that_of_the_record(whole: Callable[..., ReconRecord]) -> None:
     found, every = volume("-m", "fbp", "--roi", "auto", "--no-report", "-o", "auto.h5"), whole("-m", "fbp").volume.data

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import box_around_sample
 from tests.beamline.array_source import scan_of
+from tests.slow_cases import others_slow
 
 ROWS, COLS, AXIS, BEAM, DARK = 24, 96, 50.0, 3000.0, 100
 ANGLES = np.radians(np.arange(0, 180, 3.0))
@@ -38,7 +39,7 @@ def scan(depth: NDArray[np.float64], cone: tuple[float, float] | None = None) ->
     return source
 
 
-@pytest.mark.parametrize(("faint", "binning"), [(0.3, 2), (0.012, 1)])
+@pytest.mark.parametrize(("faint", "binning"), others_slow([(0.3, 2), (0.012, 1)]))
 def test_the_box_holds_the_sample_and_a_margin(faint: float, binning: int) -> None:
     """A dense body, and one in other rows that absorbs as much or a twentieth of it."""
     bodies = (10.0, -12.0, 8.0, 0.1, slice(6, 15)), (-14.0, 5.0, 6.0, faint, slice(12, 18))

@@ -70,6 +70,7 @@ def test_the_volume_is_the_same_to_the_bit_in_as_many_slabs_as_its_dry_run_says(
     assert left(tmp_path) == {"scan.h5", "whole.h5", "parts.h5"}
 
 
+@pytest.mark.slow
 def test_weights_of_pixels_that_measured_nothing_are_in_the_plan(tmp_path: Path) -> None:
     """They are known when views are read; a volume that no longer fits is then made in slabs."""
     scan = TwoCylinders(angles=np.radians(np.arange(0, 180, 3.0)), shape=(96, 48), axis_col=23.7)

@@ -34,6 +34,7 @@ from beamline.storage.writers.nxtomo import ScanInfo
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran
 from tests.clock import wait_until
+from tests.slow_cases import others_slow
 
 PASSES = (
     "scan.angles={scheme: interlaced, views: 12, passes: 4}",
@@ -115,11 +116,13 @@ def gone(scan: Path, output: Path) -> Sequence[str]:
 
 @pytest.mark.parametrize(
     ("command", "cone", "why"),
-    [
-        (gone, False, "no live reconstruction is running"),
-        (None, False, "no live reconstruction is running"),
-        (live((1.0, 0.1, None)), True, "the beam is a cone, in which no gain is predicted"),
-    ],
+    others_slow(
+        [
+            (gone, False, "no live reconstruction is running"),
+            (None, False, "no live reconstruction is running"),
+            (live((1.0, 0.1, None)), True, "the beam is a cone, in which no gain is predicted"),
+        ]
+    ),
 )
 def test_where_nothing_can_be_predicted_the_plan_stays_as_it_is_and_one_sentence_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: LiveCommand | None, cone: bool, why: str

@@ -71,6 +71,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {path.parent.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.glob("*/scan.h5")}
 
 
+@pytest.mark.slow
 def test_each_energy_has_a_scan(config: Path, tmp_path: Path) -> None:
     done = beamline("scan", config, "-o", tmp_path / "runs")
     assert done.exit_code == 0, done.output

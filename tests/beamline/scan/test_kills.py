@@ -151,6 +151,7 @@ def test_a_few_kills(tmp_path: Path) -> None:
     assert counted["recovered"] + counted["whole"] + counted["none"] == 3
 
 
+@pytest.mark.slow
 def test_kills_of_a_scan_that_decides(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of its four passes are taken twice; the kills come in the first, in its second time, and in the last."""
     script = [Choice.AGAIN, Choice.NEXT, Choice.AGAIN]

@@ -23,6 +23,7 @@ from tests.beamline.chosen import Scripted, choosing
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, small
 from tests.clock import wait_until
+from tests.slow_cases import others_slow
 
 
 def test_what_it_leaves_out_is_told_to_the_follower() -> None:
@@ -102,15 +103,18 @@ def test_a_stop_ends_the_wait_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize(
     ("live", "says"),
-    [
-        (script("import sys; sys.exit('out of memory')"), "ended with code 1"),
-        (script("pass"), "ended with code 0"),
-        (
-            script("""print('{"event": "failed", "message": "no axis", "exit_code": 5}'); raise SystemExit(5)"""),
-            "no axis",
-        ),
-        (lambda scan, output: [str(output / "no such program")], "could not be started"),
-    ],
+    others_slow(
+        [
+            (script("import sys; sys.exit('out of memory')"), "ended with code 1"),
+            (script("pass"), "ended with code 0"),
+            (
+                script("""print('{"event": "failed", "message": "no axis", "exit_code": 5}'); raise SystemExit(5)"""),
+                "no axis",
+            ),
+            (lambda scan, output: [str(output / "no such program")], "could not be started"),
+        ],
+        2,
+    ),
 )
 def test_a_live_reconstruction_that_dies_touches_nothing(
     tmp_path: Path, live: Callable[[Path, Path], Sequence[str]], says: str

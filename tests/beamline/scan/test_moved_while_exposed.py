@@ -25,6 +25,7 @@ from drivers.base.frame import FrameKind
 from drivers.base.protocols import Camera
 from simulators.wires.wire import plugged
 from tests.beamline.ball_scan import COMMON, STAGES, small
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("simulated_zaber")
 
@@ -129,7 +130,7 @@ def scanned(
 
 @pytest.mark.parametrize(
     ("stage", "disturb"),
-    [(kind, way) for kind in KINDS for way in WAYS if kind == "zaber" or way == "second client"],
+    others_slow([(kind, way) for kind in KINDS for way in WAYS if kind == "zaber" or way == "second client"], 2),
 )
 def test_a_view_during_which_it_is_moved_is_taken_again(stage: str, disturb: str, tmp_path: Path) -> None:
     result, error, events, path = scanned(KINDS[stage], WAYS[disturb], tmp_path, 1)

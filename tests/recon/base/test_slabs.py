@@ -17,6 +17,7 @@ from recon.base.method import Method, RunControl
 from recon.base.slabs import part_of, slabs_of
 from recon.base.volume import Grid
 from recon.voxels.projector import Projector, seen_rays
+from tests.slow_cases import others_slow
 
 
 @given(st.integers(1, 200), st.integers(1, 50), st.integers(0, 24))
@@ -50,16 +51,19 @@ def test_rows_of_a_slab_see_what_whole_views_see(
 
 @pytest.mark.parametrize(
     "method",
-    [
-        recon.Sirt(iterations=3),
-        recon.Sart(iterations=2),
-        recon.Cgls(iterations=4),
-        recon.AsdPocs(iterations=3),
-        recon.OsSirtTv(iterations=12),
-        recon.OsSirtTv(iterations=8, tv_weight=0.01, momentum=True),
-        recon.FistaTv(iterations=10),
-        recon.FistaTv(iterations=6, tv_weight=2e-3),
-    ],
+    others_slow(
+        [
+            recon.FistaTv(iterations=10),
+            recon.Sirt(iterations=3),
+            recon.Sart(iterations=2),
+            recon.Cgls(iterations=4),
+            recon.AsdPocs(iterations=3),
+            recon.OsSirtTv(iterations=12),
+            recon.OsSirtTv(iterations=8, tv_weight=0.01, momentum=True),
+            recon.FistaTv(iterations=6, tv_weight=2e-3),
+        ],
+        3,
+    ),
     ids=lambda method: method.name,
 )
 def test_slabs_that_follow_fit_together(method: Method, rng: np.random.Generator) -> None:

@@ -22,6 +22,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxelize
 from recon.voxels.projector import Projector
 from tests.recon.trigonometry import pixel_of
+from tests.slow_cases import others_slow
 
 TURN = np.linspace(0, 2 * np.pi, 48, endpoint=False)
 
@@ -175,7 +176,7 @@ def test_a_box_of_any_size_and_voxels_holds_what_the_whole_volume_holds_there(ed
     assert found.history[-1].residual < 0.2
 
 
-@pytest.mark.parametrize("turn", [TURN, 0.7 * TURN])
+@pytest.mark.parametrize("turn", others_slow([TURN, 0.7 * TURN]))
 def test_a_cone_too_wide_for_a_box_of_its_pixels_is_fitted(turn: np.ndarray) -> None:
     # The detector's half width at the axis is 20 mm, and so far away is the source, but for 2 mm.
     views = Geometry.cone(turn, (9, 40), 2.0, 22.0, 44.0)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from beamline.features.tuning.align import align_pair, finest_structure
 from recon.prep.align import AxisError
+from tests.slow_cases import others_slow
 
 SHAPE = (120, 200)
 
@@ -34,7 +35,7 @@ def noise(seed: int, level: float = 0.02) -> NDArray[np.float64]:
     return np.random.default_rng(seed).normal(0, level, SHAPE)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 0.3, -1.5, 3.0])
+@pytest.mark.parametrize("tilt_deg", others_slow([0.0, 0.3, -1.5, 3.0], 2))
 @pytest.mark.parametrize("axis_col", [99.5, 108.3])
 def test_axis_and_tilt_are_found_within_their_uncertainty(tilt_deg: float, axis_col: float) -> None:
     tilt = math.radians(tilt_deg)

@@ -87,6 +87,7 @@ def test_projections_of_nothing_are_refused_by_name_and_empty_a_model_that_is_th
     assert float(left.gaussians.densities.mean()) < 0.3 * float(start.densities.mean())
 
 
+@pytest.mark.slow
 def test_constant_projections_leave_all_finite_and_are_explained_where_they_can_be() -> None:
     # No body that fits into the field has them: its edge would have to be infinitely dense.
     found = fitted(np.ones((32, *SHAPE), np.float32), finish=0)

@@ -80,6 +80,7 @@ def parallel() -> tuple[np.ndarray, Geometry]:
     return Projector(views, Grid.matching(views)).forward(truth), views
 
 
+@pytest.mark.slow
 def test_slabs_make_as_many_sweeps_as_the_first_one_decided(
     parallel: tuple[np.ndarray, Geometry], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -93,6 +94,7 @@ def test_slabs_make_as_many_sweeps_as_the_first_one_decided(
         decided = decide.made
 
 
+@pytest.mark.slow
 def test_a_finish_without_time_for_trials_has_the_weight_by_the_noise(
     parallel: tuple[np.ndarray, Geometry], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -75,6 +75,7 @@ def test_a_sample_within_the_field_gets_the_volume_of_the_method_to_the_bit() ->
     assert made.outside is None and "sample_radius" not in made.settings
 
 
+@pytest.mark.slow
 def test_a_can_as_wide_as_the_field_is_not_taken_for_a_wider_one() -> None:
     assert sample_radius(Views(views_of(can(COLS / 2)), GEOMETRY)) is None
 

@@ -67,6 +67,7 @@ def true_gain(n: int, photons: float) -> float:
     return 10 * math.log10(half / whole)
 
 
+@pytest.mark.slow
 def test_where_noise_makes_the_error_views_bring_what_is_predicted() -> None:
     law = law_of(96, 300)[0]
     assert law.n_views == 96 and law.exponent > 0.5
@@ -85,6 +86,7 @@ def test_views_at_the_same_angles_bring_less_than_others() -> None:
     assert 0 < law.gain(again=32).mean < law.gain(views=32).mean
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "photons"), others_slow([(96, 300), (192, 300), (192, 3000)]))
 def test_the_gain_of_the_last_pass_is_measured_apart_from_the_law(n: int, photons: float) -> None:
     _, gained = law_of(n, photons)

@@ -75,6 +75,7 @@ def test_the_volume_of_a_tilted_scan_is_as_good_as_that_of_a_straight_one() -> N
     assert _quality(as_it_is) < _quality(straight) - 1
 
 
+@pytest.mark.slow
 def test_no_tilt_changes_nothing() -> None:
     plain, _ = prepare(_source(1.5), SELECTION)
     zero, said = prepare(_source(1.5), SELECTION.with_steps(TiltAndLens(0.0)))
