@@ -21,7 +21,7 @@ from recon.base.setting import setting
 
 PAIRS = 32  # changes that follow one another, before anything is reported
 SHAKE_MEMORY = 0.02  # weight of the newest pair
-CLIPPED = 4.0  # mean absolute deviations that count of a change, so that a jump is no vibration
+CLIPPED = 4.0  # mean absolute deviations that count of a change: a jump is no vibration, and noise keeps its variance
 OWN = 4 / 3  # of the variance of x: minus the covariance of changes that follow one another
 FROM_NOISE = math.sqrt(1 + OWN**2 + 1 / 9)  # sigma of a change over that of a view's own displacement
 SHAKE_SIGMAS = 6.0  # standard deviations of the estimate: a false alarm in 10**9 estimates

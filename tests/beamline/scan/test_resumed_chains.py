@@ -199,7 +199,7 @@ class PartsOfARun(RuleBasedStateMachine):
 
 
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize(("runs", "steps"), others_slow([(3, 4), (15, 7)]))
+@pytest.mark.parametrize(("runs", "steps"), others_slow([(3, 4), (9, 7)]))
 def test_any_order(runs: int, steps: int) -> None:
     drawn = settings(max_examples=runs, stateful_step_count=steps, deadline=None, phases=[Phase.generate])
     run_state_machine_as_test(PartsOfARun, settings=drawn)
