@@ -44,7 +44,7 @@ from drivers.base.frame import FrameKind
 from tests.beamline.storage.conftest import INFO, scan_frames
 
 LOADED = (ome_zarr, tiff)  # once, before the forks: `info` loads them
-LAST, WHOLE = 100, 4
+LAST, EACH, WHOLE = 100, 40, 4
 FRAMES = [
     replace(frame, counts=np.tile(frame.counts, (4, 4))) for frame in scan_frames(np.random.default_rng(5), 2, 3, 15)
 ]
@@ -244,8 +244,10 @@ def close(rig: Rig) -> None:
     begun = rig.begin()
     rig.fresh(begun)
     total = rig.do(rig.end)["writes"]
-    for fault, step in (("kill", 1), ("error from", 4)):  # 4 and the number of errors have no common divisor
-        for n in range(max(1, total - LAST + 1), total + 1, step):
+    last = range(total - LAST + 1, total + 1)
+    kills = [n for n in last if n > total - EACH or n % 3 == 0]
+    for fault, numbers in (("kill", kills), ("error from", last[::4])):  # 4 and the number of errors share no divisor
+        for n in numbers:
             rig.fresh(begun)
             done = rig.do(rig.end, FAULTS[fault](n))
             committed = max(rig.committed(), len(FRAMES) - 2)

@@ -53,9 +53,9 @@ def _assert_said_in_a_sentence(rows: list[Row]) -> None:
         assert row["stderr"] == "", row
 
 
-def test_each_of_the_last_writes_of_a_scan_is_its_last_or_the_disk_fails_from_it_on(tmp_path: Path) -> None:
+def test_a_kill_at_each_of_the_last_writes_of_a_scan_or_a_disk_that_fails_from_one_on(tmp_path: Path) -> None:
     rows = _rows(tmp_path, "close")
-    assert _counted(rows) == {"kill": 100, "error from": 25}
+    assert _counted(rows) == {"kill": 60, "error from": 25}
     _assert_all_is_there(rows)
     _assert_said_in_a_sentence([row for row in rows if row["fault"] != "kill"])
 

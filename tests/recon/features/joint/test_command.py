@@ -40,9 +40,10 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module", autouse=True)
 def weight_given() -> Iterator[None]:
-    """No trials of weights, which take most of the time; test_series.py has them."""
+    """No trials of weights and factors, which take most of the time; others test them."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("recon.features.joint.series.weights_by_views", lambda *_, **__: np.full(2, 0.01))
+        patched.setattr("recon.features.joint.series.smooth_factors", lambda *_: None)
         yield
 
 
