@@ -147,7 +147,7 @@ def test_a_client_reads_what_can_be_measured_next_and_answers(tmp_path: Path) ->
         with pytest.raises(thread.RemoteError, match="no scan is running"):
             client.put("T:Decide", "next", timeout=WITHIN)
         with asking(run) as answers:
-            with pytest.raises(thread.RemoteError, match="'wide' cannot be chosen now; on offer: next, enough"):
+            with pytest.raises(thread.RemoteError, match="'offset' cannot be chosen now; on offer: next, enough"):
                 client.put("T:Decide", "offset", timeout=WITHIN)
             _put(server, client, "T:Decide", "enough")
             assert answers == ["enough"] and client.get("T:Decide") == ""
