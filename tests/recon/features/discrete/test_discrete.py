@@ -80,11 +80,20 @@ def test_smooth_matter_is_that_of_total_variation() -> None:
 
 
 @pytest.mark.slow
-def test_auto_takes_it_for_grains_and_does_not_try_patches() -> None:
-    found = recon.reconstruct(measured(grains()), VIEWS, recon.Auto((recon.FistaTv(), recon.Discrete(), PnpDct())))
+def test_auto_takes_it_for_grains_and_tries_neither_patches_nor_a_fit() -> None:
+    candidates = recon.FistaTv(), recon.Discrete(), PnpDct(), recon.R2()
+    found = recon.reconstruct(measured(grains()), VIEWS, recon.Auto(candidates))
     assert found.method == "discrete"
-    assert "pnp-dct not tried" in found.settings["chosen_because"]
+    assert all(f"{name} not tried" in found.settings["chosen_because"] for name in ("pnp-dct", "r2"))
     assert "levels_of_materials" in found.settings
+
+
+@pytest.mark.slow
+def test_the_finish_of_a_fit_pulls_to_them_too() -> None:
+    made = [recon.reconstruct(measured(grains()), VIEWS, recon.R2(steps=60, finish=n)) for n in (None, 8)]
+    few, smooth = (error(each.volume.data, grains()) for each in made)
+    assert few < 0.8 * smooth
+    assert ["levels_of_materials" in each.settings for each in made] == [True, False]
 
 
 @pytest.mark.slow
