@@ -45,10 +45,6 @@ class Prior(NamedTuple):
     patches: bool = False
     materials: MaterialPrior | None = None
 
-    @property
-    def has_materials(self) -> bool:
-        return bool(self.materials and self.materials.levels)
-
     @classmethod
     def of(cls, values: Sequence[Any]) -> Prior:
         """A prior, or its values from a file."""

@@ -111,7 +111,7 @@ class TrialChoice(NamedTuple):
     def few_materials(self) -> bool:
         """Whether few materials predict views held out better than total variation: costlier candidates, which know of
         no levels, are then not tried, to save the time."""
-        return any(each.prior is not None and each.prior.has_materials for each in self.predictions)
+        return any(each.prior and each.prior.materials and each.prior.materials.levels for each in self.predictions)
 
     @property
     def at(self) -> int | None:
