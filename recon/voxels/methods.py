@@ -22,6 +22,7 @@ from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
 from recon.voxels.trial import PATCH_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
+    NORM,
     Buffers,
     Momentum,
     TotalVariationProx,
@@ -87,8 +88,9 @@ class FistaTv(VoxelMethod):
         if self.tv_weight is None:
             weight = choose_weight(problem, x, self.iterations, trial)
         else:
-            share, plain = self.tv_weight, projector.plain
-            weight = problem.decide("weight", lambda: share * unit * largest_eigenvalue(plain, problem.weight))
+            share, rays = self.tv_weight, problem.weight
+            norm = problem.decide(NORM, lambda: largest_eigenvalue(projector.plain, rays))
+            weight = problem.decide("weight", lambda: share * unit * norm)
         subsets = Subsets.of(problem, self.subsets, FEWEST_SUBSETS)
         x = ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
         if self.tv_weight is None and unit > 0:

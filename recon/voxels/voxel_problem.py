@@ -159,6 +159,7 @@ def times_power(array: F32, power: int) -> F32:
     return array
 
 
+NORM = "norm"  # name of the decision on the largest eigenvalue, which does not depend on the data
 POWER_ROUNDS = 6  # of power iteration
 
 
