@@ -17,7 +17,7 @@ from recon.base.method import Plain
 from recon.base.setting import Count
 from recon.base.volume import Volume
 from recon.features.discrete.choose import PULLS, MaterialTrial, in_field
-from recon.features.discrete.mixture import MaterialPull, probabilities
+from recon.features.discrete.mixture import MaterialPull, probabilities, thin_parts
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
@@ -53,7 +53,7 @@ class Discrete(VoxelMethod):
     takes: ClassVar[frozenset[str]] = frozenset({"device"})
     halo: ClassVar[int] = FistaTv.halo + 12
     error_bars: ClassVar[tuple[float, float] | None] = 2.2, 0.1
-    buffers: ClassVar[Buffers] = Buffers(9.3, 3.0, 4.8, filtered=True)
+    buffers: ClassVar[Buffers] = Buffers(9.6, 3.0, 4.8, filtered=True)
     first_sweeps: ClassVar[int] = FistaTv.iterations
 
     iterations: Count = 16
@@ -125,13 +125,13 @@ class Discrete(VoxelMethod):
         self, problem: VoxelProblem, x: F32, weight: NoiseBalance | float, materials: MaterialPrior, done: int
     ) -> F32:
         """The volume x [y, x, z] after `iterations` passes with a pull to the materials, `done` passes before."""
-        where = in_field(problem)
+        where, thin = in_field(problem), thin_parts(x, materials)
         further = replace(problem, go_on=lambda sweep, left: problem.go_on(done + sweep, left))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
         subsets = Subsets.of(problem, SUBSETS, FEWEST_SUBSETS)
         x = ordered_fista(
             further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS,
-            pull=MaterialPull(materials, where),
+            pull=MaterialPull(materials, where, thin),
         )  # fmt: skip
         share = problem.decide(UNDECIDED, lambda: float(np.mean(probabilities(x, materials).max(0)[where] <= 0.5)))
         of_scan = materials.scaled(problem.units.density)._asdict()

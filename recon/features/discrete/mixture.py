@@ -15,14 +15,19 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import grey_closing, grey_opening
 
 from recon.base.arrays import F32, F64, some_values
 from recon.base.decisions import MaterialPrior
 from recon.kernels.cpu.materials import MaterialTable, posterior_mean
 
-NOISE, MOST_NOISE, SPREAD = 0.08, 0.2, 0.06
-"""Noise and spread of a voxel over the gap of levels. A noise of 0.2 suits few views (+0.3 dB at 45 of 256 columns); at
-90 views it takes cracks of half a voxel to one voxel from 0.63 to 0.53 of their depth (FISTA-TV: 0.66)."""
+NOISE, SPREAD = 0.2, 0.06
+"""Noise and spread of a voxel over the gap of levels. A noise of 0.08 costs 0.2 dB at 60 views of 192 columns."""
+THIN = 0.2
+"""Over the gap of levels: what is one or two voxels thick and stands out by more before the pull is not pulled towards
+what is on both sides of it. Without, cracks of half a voxel to one voxel go from 0.97 to 0.90 of their depth by total
+variation (60 views of 192 columns)."""
 PARTIAL = (0.5, 0.9)
 """Probabilities of a partial voxel, within a material and where two meet."""
 EMPTY = 0.02
@@ -60,12 +65,24 @@ def fitted_levels(values: F32, count: int) -> tuple[F64, F64]:
 
 
 def noise_and_spread(materials: MaterialPrior) -> tuple[float, float]:
-    """Standard deviations of a voxel's error, and of a material's density.
+    """Standard deviations of a voxel's error, and of a material's density."""
+    gap = _gap(materials)
+    return NOISE * gap, SPREAD * gap
 
-    Fewer views leave more error, and the less total variation predicts them best.
+
+def _gap(materials: MaterialPrior) -> float:
+    return float(np.exp(np.log(np.diff(materials.levels)).mean()))
+
+
+def thin_parts(x: F32, materials: MaterialPrior) -> NDArray[np.int8]:
+    """1 in what is one or two voxels thick and less dense than both sides of it, -1 in what is denser, else 0.
+
+    Memory: four volumes of x [y, x, z], for a moment.
     """
-    gap = float(np.exp(np.log(np.diff(materials.levels)).mean()))
-    return min(MOST_NOISE, NOISE / math.sqrt(materials.tv_share)) * gap, SPREAD * gap
+    less, more = grey_closing(x, 3) - x, x - grey_opening(x, 3)
+    thin = np.sign(less - more).astype(np.int8)
+    thin[np.maximum(less, more) <= THIN * _gap(materials)] = 0
+    return thin
 
 
 def table_of(materials: MaterialPrior) -> MaterialTable:
@@ -96,11 +113,13 @@ class MaterialPull:
 
     Attributes:
         where: [y, x, z] voxels that are pulled.
+        thin: [y, x, z], see `thin_parts`.
         follows: levels are fitted anew to each volume.
     """
 
     materials: MaterialPrior
-    where: np.ndarray
+    where: NDArray[np.bool_]
+    thin: NDArray[np.int8]
     follows: bool = False
 
     @property
@@ -117,7 +136,8 @@ class MaterialPull:
     def target(self, x: F32) -> F32:
         z = np.empty_like(x)
         posterior_mean(x, table_of(self.materials_in(x)), z)
-        np.copyto(z, x, where=~self.where)
+        for pulled, own, where, thin in zip(z, x, self.where, self.thin, strict=True):
+            np.copyto(pulled, own, where=~where | ((pulled - own) * thin > 0))
         return z
 
 

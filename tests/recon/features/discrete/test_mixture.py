@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from recon.features.discrete.mixture import (
     noise_and_spread,
     probabilities,
     table_of,
+    thin_parts,
 )
 from recon.kernels.cpu.materials import BLUR, posterior_mean
 from tests.recon.features.discrete.reference import posterior_by_integrals, shares_of_neighbours
@@ -70,10 +72,14 @@ def test_the_pull_is_the_gradient_of_a_penalty() -> None:
         assert y - posterior_by_integrals(y, f, levels, noise, spread, partial)[0] == pytest.approx(slope, abs=1e-6)
 
 
+def pull_of(x: F32) -> MaterialPull:
+    return MaterialPull(TWO, np.ones(x.shape, bool), np.zeros(x.shape, np.int8))
+
+
 def test_levels_are_fixed_points_and_noise_near_them_shrinks() -> None:
     x = np.full((12, 12, 12), 0.2, np.float32)
     x[6:] = 1.0
-    pull = MaterialPull(TWO, np.ones(x.shape, bool))
+    pull = pull_of(x)
     np.testing.assert_allclose(pull.target(x), x, atol=2e-3)
     noisy = x + np.random.default_rng(0).normal(0, 0.05, x.shape).astype(np.float32)
     assert np.std(pull.target(noisy) - x) < 0.75 * np.std(noisy - x)
@@ -82,15 +88,28 @@ def test_levels_are_fixed_points_and_noise_near_them_shrinks() -> None:
 def test_a_voxel_half_way_between_two_materials_stays() -> None:
     x = np.full((12, 12, 12), 0.2, np.float32)
     x[6:], x[5] = 1.0, 0.6
-    assert np.abs(MaterialPull(TWO, np.ones(x.shape, bool)).target(x)[5] - 0.6).max() < 0.02
+    assert np.abs(pull_of(x).target(x)[5] - 0.6).max() < 0.02
 
 
 def test_voxels_that_are_not_to_be_pulled_keep_their_bits() -> None:
     x = blocks((8, 8, 8), TWO.levels)
     where = x > 0.5
-    z = MaterialPull(TWO, where).target(x)
+    z = replace(pull_of(x), where=where).target(x)
     np.testing.assert_array_equal(z[~where], x[~where])
     assert (z[where] != x[where]).any()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_thin_crack_or_bridge_is_not_filled_but_may_deepen(sign: int) -> None:
+    """One plane, from near its sides to near the other material: it is pulled to the latter alone."""
+    x = np.full((12, 12, 12), 1.0 if sign > 0 else 0.2, np.float32)
+    x[6] -= sign * np.linspace(0.2, 0.72, 12, dtype=np.float32)
+    thin = thin_parts(x, TWO)
+    np.testing.assert_array_equal(np.unique(np.delete(thin, 6, 0)), [0])
+    assert (thin[6] == sign).mean() > 0.9
+    free, kept = (MaterialPull(TWO, np.ones(x.shape, bool), part).target(x)[6] - x[6] for part in (0 * thin, thin))
+    assert (sign * free).max() > 0.02 and (sign * kept)[thin[6] == sign].max() <= 0
+    np.testing.assert_array_equal(kept[sign * free < 0], free[sign * free < 0])
 
 
 def test_probabilities_leave_the_rest_to_partial_voxels() -> None:
