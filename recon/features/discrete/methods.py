@@ -17,7 +17,7 @@ from recon.base.method import Plain
 from recon.base.setting import Count
 from recon.base.volume import Volume
 from recon.features.discrete.choose import PULLS, MaterialTrial, in_field
-from recon.features.discrete.mixture import MaterialPull, probabilities, thin_parts
+from recon.features.discrete.mixture import MaterialPull, probabilities, thin_parts, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
@@ -28,8 +28,8 @@ from recon.voxels.trial import SUBSETS, TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
 MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
-"""Names of the decisions on the materials, in the units of the scan, and on the share of voxels that are more likely
-partial than of one material; and how settings end that state the materials."""
+"""Names of the decisions on the materials, in the units of the scan, and on the expected share of voxels on the wrong
+side of half way between two; and how settings end that state the materials."""
 _TRIALS = 6  # trials of materials, as a rule
 
 
@@ -133,7 +133,7 @@ class Discrete(VoxelMethod):
             further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS,
             pull=MaterialPull(materials, where, thin),
         )  # fmt: skip
-        share = problem.decide(UNDECIDED, lambda: float(np.mean(probabilities(x, materials).max(0)[where] <= 0.5)))
+        share = problem.decide(UNDECIDED, lambda: undecided_share(x[where], materials))
         of_scan = materials.scaled(problem.units.density)._asdict()
         problem.decide.settings |= {UNDECIDED: share, **{name + _OF: value for name, value in of_scan.items()}}
         return x

@@ -13,17 +13,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import grey_closing, grey_opening
+from scipy.special import ndtr
 
 from recon.base.arrays import F32, F64, some_values
 from recon.base.decisions import MaterialPrior
 from recon.kernels.cpu.materials import MaterialTable, posterior_mean
 
-NOISE, SPREAD = 0.2, 0.06
-"""Noise and spread of a voxel over the gap of levels. A noise of 0.08 costs 0.2 dB at 60 views of 192 columns."""
+NOISE, LEFT, SPREAD = 0.2, 0.08, 0.06
+"""Noise of a voxel that is pulled and of one of the volume made, and spread of a material, over the gap of levels. A
+first noise of 0.08 costs 0.2 dB at 60 views of 192 columns."""
+DOUBT = 0.16
+"""Error of a voxel near half way between two levels, over their gap, by which `undecided_share` is told."""
 THIN = 0.2
 """Over the gap of levels: what is one or two voxels thick and stands out by more before the pull is not pulled towards
 what is on both sides of it. Without, cracks of half a voxel to one voxel go from 0.97 to 0.90 of their depth by total
@@ -64,10 +69,17 @@ def fitted_levels(values: F32, count: int) -> tuple[F64, F64]:
     return mean[order], weight[:count][order] / weight[:count].sum()
 
 
-def noise_and_spread(materials: MaterialPrior) -> tuple[float, float]:
+def undecided_share(x: F32, materials: MaterialPrior) -> float:
+    """Expected share of voxels on the wrong side of half way between two levels; it is of some values of x."""
+    few, levels = some_values(x, _LOOKED_AT), materials.levels
+    off = [np.abs(few - (high + low) / 2) / (high - low) for low, high in pairwise(levels)]
+    return float(ndtr(-np.min(off, axis=0) / DOUBT).mean())
+
+
+def noise_and_spread(materials: MaterialPrior, noise: float = NOISE) -> tuple[float, float]:
     """Standard deviations of a voxel's error, and of a material's density."""
     gap = _gap(materials)
-    return NOISE * gap, SPREAD * gap
+    return noise * gap, SPREAD * gap
 
 
 def _gap(materials: MaterialPrior) -> float:
@@ -85,11 +97,11 @@ def thin_parts(x: F32, materials: MaterialPrior) -> NDArray[np.int8]:
     return thin
 
 
-def table_of(materials: MaterialPrior) -> MaterialTable:
-    """What the kernel knows of these materials."""
+def table_of(materials: MaterialPrior, noise: float = NOISE) -> MaterialTable:
+    """What the kernel knows of these materials; `noise` over the gap of levels."""
     m, weight = np.array(materials.levels), np.array(materials.weights)
-    gaps, (noise, spread) = np.diff(m), noise_and_spread(materials)
-    variance = noise**2 + spread**2
+    gaps, (error, spread) = np.diff(m), noise_and_spread(materials, noise)
+    variance = error**2 + spread**2
     beyond = _REACH * math.sqrt(variance)
     values = np.linspace(m[0] - beyond, m[-1] + beyond, _ROWS)
     likelihoods = np.exp(-0.5 * (values[:, None] - m) ** 2 / variance) / math.sqrt(2 * math.pi * variance)
@@ -143,7 +155,8 @@ class MaterialPull:
 
 def probabilities(x: F32, materials: MaterialPrior) -> F32:
     """[material, ...] posterior probability that a voxel of x [a, b, c] is of one material; the rest is that of a
-    partial voxel. Memory: as many volumes as materials, and one."""
+    partial voxel. Cautious: of voxels with a half and more, over 99 % are within a quarter of the gap of that material.
+    Memory: as many volumes as materials, and one."""
     found = np.empty((len(materials.levels), *x.shape), np.float32)
-    posterior_mean(x, table_of(materials), np.empty_like(x), found)
+    posterior_mean(x, table_of(materials, LEFT), np.empty_like(x), found)
     return found

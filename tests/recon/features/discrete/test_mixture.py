@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from recon.base.decisions import MaterialPrior
 from recon.features.discrete.mixture import (
+    DOUBT,
     MaterialPull,
     fitted_levels,
     noise_and_spread,
     probabilities,
     table_of,
     thin_parts,
+    undecided_share,
 )
 from recon.kernels.cpu.materials import BLUR, posterior_mean
 from tests.recon.features.discrete.reference import posterior_by_integrals, shares_of_neighbours
@@ -118,6 +120,15 @@ def test_probabilities_leave_the_rest_to_partial_voxels() -> None:
     p = probabilities(x, TWO)
     assert p.min() >= 0 and p.sum(0).max() <= 1
     assert p[0, 1].min() > 0.5 and p[1, 10].min() > 0.5 and p[:, 5].sum(0).max() < 0.1
+
+
+def test_the_share_of_wrong_voxels_is_told() -> None:
+    """Of any density alike, with normal errors."""
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(-0.5, 1.7, 200_000)
+    seen = truth + rng.normal(0, DOUBT * 0.8, truth.size)
+    wrong = float(((truth > 0.6) != (seen > 0.6)).mean())
+    assert undecided_share(seen.astype(np.float32), TWO) == pytest.approx(wrong, rel=0.05)
 
 
 @pytest.mark.parametrize("levels", [(0.2, 1.0), (0.15, 0.5, 1.0)])
