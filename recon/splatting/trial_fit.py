@@ -13,7 +13,7 @@ from recon.base.geometry import Geometry
 from recon.splatting.finish import FINISH_SWEEPS, beyond_voxels, level_of, refine
 from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
-from recon.voxels.choice import FEW_MATERIALS, Prediction, TrialChoice, significantly_better
+from recon.voxels.choice import Prediction, TrialChoice, significantly_better
 from recon.voxels.projector import projection_lines
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem, times_power
@@ -30,14 +30,11 @@ FIRST_SHARE = 0.25
 def predict(method: Fit, trial: Trial, so_far: TrialChoice, prior: Prior) -> Prediction:
     """The prediction of a fit of the views that are not held out: a fit of all views would know the others.
 
-    It ends after a quarter of its steps where it then leads the simpler candidates, or is far behind total variation;
-    it does not begin where few materials predict these views, unless the best is asked for.
+    It ends after a quarter of its steps where it then leads the simpler candidates, or is far behind total variation.
 
     No prior is named where the fit takes matter beyond the box off the views: from all of them a region of interest
     gets one that costs 1.3 dB.
     """
-    if so_far.few_materials and so_far.least_gain > 0:
-        return Prediction(method.name, remark=f"{method.name} not tried, as {FEW_MATERIALS}")
     begin = trial.settings.now()
     tried = _Fit.of(method, trial, FIRST_SHARE)
     smooth, best = trial.residuals_of_weight(prior.weight), so_far.least

@@ -20,7 +20,6 @@ LEAST_GAIN = 0.02
 """Share by which a costlier candidate must lower a residual. A fit of a tooth lowers it by 1.3 %, in four times the
 time."""
 
-FEW_MATERIALS = "few materials predict the views"  # why a candidate is not tried
 _MEASURE = "root mean square left of views held out, in line integrals"  # by which a choice is explained
 _ERRORS = 1.0  # standard errors of the difference, up to which two candidates predict alike
 _OCTAVES = 10  # from the first strength, at most: cones of coarse voxels take 6 to 9, and 40 change nothing

@@ -16,7 +16,7 @@ from recon.base.method import Plain
 from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values
-from recon.voxels.choice import FEW_MATERIALS, TRIALS, Prediction, TrialChoice
+from recon.voxels.choice import TRIALS, Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_SWEEPS
 from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
@@ -207,13 +207,10 @@ class PnpDct(VoxelMethod):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction with the best threshold; with one of its own that of the method's volume.
 
-        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.prior`; nor where few
-        materials predict the views better than total variation, to save the time.
+        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.prior`.
         """
-        few = so_far.few_materials
-        if self.patch_threshold is None and so_far.tried and (few or trial.settings.wide):
-            where = FEW_MATERIALS if few else "the sample is wider than the field"
-            return Prediction(self.name, remark=f"{self.name} not tried, as {where}")
+        if self.patch_threshold is None and so_far.tried and trial.settings.wide:
+            return Prediction(self.name, remark=f"{self.name} not tried, as the sample is wider than the field")
         if self.patch_threshold is not None or trial.prior is None or not trial.prior.strength:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)

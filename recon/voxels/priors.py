@@ -157,8 +157,8 @@ RENEWED = 2
 """Sweeps after which the volume is made anew towards which steps are pulled."""
 
 
+# Methods with a pull that views held out may prefer, also after the sweeps of a fit, see `Discrete`.
 PULLS: dict[str, MethodEntry] = in_folders("recon.features", "PULLS")
-"""Methods with a pull that views held out may prefer, also after the sweeps of a fit, see `Discrete`."""
 
 
 class Pull(Protocol):
