@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from recon.base.decisions import MaterialPrior
 from recon.features.discrete.mixture import (
     DOUBT,
+    NOISE,
+    SPREAD,
     MaterialPull,
     fitted_levels,
-    noise_and_spread,
+    gap_of,
     probabilities,
     table_of,
     thin_parts,
@@ -41,13 +43,13 @@ def blocks(shape: tuple[int, int, int], levels: tuple[float, ...], seed: int = 0
 def test_the_posterior_mean_is_that_of_integrals_over_the_true_density(
     materials: MaterialPrior, shape: tuple[int, int, int]
 ) -> None:
-    x, table, levels = blocks(shape, materials.levels), table_of(materials), np.array(materials.levels)
+    x, table, levels = blocks(shape, materials.levels), table_of(materials, NOISE), np.array(materials.levels)
     z, p = np.empty_like(x), np.empty((levels.size, *shape), np.float32)
     posterior_mean(x, table, z, p)
     at = (x.ravel().astype(float) - table.first) * table.scale
     shares = np.stack([np.interp(at, np.arange(len(table.shares)), table.shares[:, m]) for m in range(levels.size)])
     f = shares_of_neighbours(shares.reshape(-1, *shape), BLUR)
-    noise, spread = noise_and_spread(materials)
+    noise, spread = NOISE * gap_of(materials), SPREAD * gap_of(materials)
     for i in np.random.default_rng(1).permutation(x.size)[:40]:
         voxel = np.unravel_index(i, shape)
         mean, own = posterior_by_integrals(
@@ -59,7 +61,7 @@ def test_the_posterior_mean_is_that_of_integrals_over_the_true_density(
 
 def test_the_pull_is_the_gradient_of_a_penalty() -> None:
     """y - E[t | y] = φ'(y) of φ = -σ² log p(y) for probabilities that stay: Tweedie's formula."""
-    noise, spread = noise_and_spread(TWO)
+    noise, spread = NOISE * gap_of(TWO), SPREAD * gap_of(TWO)
     f, levels, partial = np.array([0.7, 0.3]), np.array(TWO.levels), (0.5, 0.9)
     between = partial[0] + (partial[1] - partial[0]) * min(4 * f[0] * f[1], 1)
 
