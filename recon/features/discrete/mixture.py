@@ -39,6 +39,7 @@ PARTIAL = (0.5, 0.9)
 EMPTY = 0.02
 """Of a typical high density: voxels below do not take part in the fit of levels."""
 _ROWS, _REACH = 4096, 6.0  # of the tables, and standard deviations beyond the outer levels
+_LEAST_GAP = 1e-3  # between neighbouring levels, over that between the outer ones
 _BINS, _ROUNDS, _LOOKED_AT = 400, 60, 300_007
 
 
@@ -75,6 +76,11 @@ def undecided_share(x: F32, materials: MaterialPrior) -> float:
     few, levels = some_values(x, _LOOKED_AT), materials.levels
     off = [np.abs(few - (high + low) / 2) / (high - low) for low, high in pairwise(levels)]
     return float(ndtr(-np.min(off, axis=0) / DOUBT).mean())
+
+
+def are_apart(levels: F64) -> bool:
+    """Whether levels ascend; two of a volume of fewer materials may be one."""
+    return bool(np.diff(levels).min() > _LEAST_GAP * np.ptp(levels))
 
 
 def gap_of(materials: MaterialPrior) -> float:
@@ -137,10 +143,12 @@ class MaterialPull:
         return self.materials.pull
 
     def materials_in(self, x: F32) -> MaterialPrior:
-        """The materials, their levels fitted to a volume if they follow it."""
+        """The materials, their levels fitted to a volume if they follow it and stay apart."""
         if not self.follows:
             return self.materials
         levels, weights = fitted_levels(x[self.where], len(self.materials.levels))
+        if not are_apart(levels):
+            return self.materials
         return self.materials._replace(levels=tuple(levels.tolist()), weights=tuple(weights.tolist()))
 
     def target(self, x: F32) -> F32:

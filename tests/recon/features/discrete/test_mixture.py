@@ -15,6 +15,7 @@ from recon.features.discrete.mixture import (
     NOISE,
     SPREAD,
     MaterialPull,
+    are_apart,
     fitted_levels,
     gap_of,
     probabilities,
@@ -87,6 +88,15 @@ def test_levels_are_fixed_points_and_noise_near_them_shrinks() -> None:
     np.testing.assert_allclose(pull.target(x), x, atol=2e-3)
     noisy = x + np.random.default_rng(0).normal(0, 0.05, x.shape).astype(np.float32)
     assert np.std(pull.target(noisy) - x) < 0.75 * np.std(noisy - x)
+
+
+def test_levels_that_follow_a_volume_stay_where_two_of_them_would_meet() -> None:
+    """All voxels are of one density but a few of another: three levels have nothing to follow."""
+    x = np.zeros((12, 12, 12), np.float32)
+    x[6:] = 0.07
+    pull = replace(pull_of(x), materials=THREE, follows=True)
+    assert not are_apart(fitted_levels(x, 3)[0])
+    assert pull.materials_in(x) == THREE and np.isfinite(pull.target(x)).all()
 
 
 def test_a_voxel_half_way_between_two_materials_stays() -> None:
