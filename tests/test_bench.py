@@ -249,7 +249,7 @@ def test_leagues(monkeypatch: Patch, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "splatline fbp" in league.table({"Diamond": {"splatline fbp": score}})
     kept = users.Kept(tmp_path / "scores.json")
     cell = users.Cell("packed", 32, 8, 1.0, 1e4, 1)
-    small(monkeypatch, users, play=lambda *_: users.Score(20.0, 0.5, None, None, None, 1.0, 100.0))
+    small(monkeypatch, users, play=lambda *_: users.Score(20.0, 0.5, 0.1, None, None, None, 1.0, 100.0))
     users.play_all(kept, [cell], ["fbp"], False, 10.0)
     assert "fbp" in users.tables(kept, [cell])
 

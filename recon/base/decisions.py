@@ -62,11 +62,13 @@ class Decisions:
     Attributes:
         made: so far, by name; plain numbers and lists of them.
         prior: of the volume, in the units of the scan, where it was chosen before; None: the method decides.
+        settings: what the volume's record says beside the settings of its method.
     """
 
     def __init__(self, seed: int = 0, followed: Mapping[str, Sequence[Any]] | None = None) -> None:
         self.seed = seed
         self.prior: Prior | None = None
+        self.settings: dict[str, Any] = {}
         self.made: dict[str, list[Any]] = {}
         self._followed = followed or {}
 

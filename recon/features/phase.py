@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from recon.base.arrays import F32, F64
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.units import HC
 from recon.base.view_data import Views
@@ -20,6 +21,7 @@ from recon.voxels.choice import exceeds_standard_error, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter
 from recon.voxels.held_out import LEAST_VIEWS, predicted_views
 from recon.voxels.methods import FistaTv
+from recon.voxels.voxel_problem import NORM
 
 _REACH = 4.0  # lengths: beyond, a pixel's influence is below exp(-4)
 TRIAL_ROWS, TRIAL_COPIES = 8, 10
@@ -143,11 +145,15 @@ def length_by_held_out_views(
     method, grid = FistaTv(_SWEEPS, _TV_WEIGHT), Grid.matching(geometry)
     weights = None if known.all() else np.broadcast_to(known.astype(np.float32), views.shape)
 
+    norms: list[float] = []
+
     @cache
     def residuals_of(square: float) -> F64:
         filtered = views.copy()
         Paganin(math.sqrt(square)).retrieve(filtered, floor)
-        unseen, images = predicted_views(method, Views(filtered, geometry, weights), grid, _ONE_IN)
+        decide = Decisions(0, {NORM: norms})
+        unseen, images = predicted_views(method, Views(filtered, geometry, weights), grid, _ONE_IN, decide)
+        norms[:] = decide.made[NORM]
         fringes = (1 + (2 * math.pi) ** 2 * square * _squared_frequencies(views)).astype(np.float32)
         off = np.stack([_filtered_light(image, fringes) for image in images]) - np.exp(-views[unseen])
         return np.sqrt(np.square(off[:, known]).mean(axis=1, dtype=np.float64))

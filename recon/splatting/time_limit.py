@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Iterative
@@ -137,7 +138,7 @@ class FinalFit(Iterative):
         Raises:
             ValueError: no view has arrived, or the views hold no matter.
         """
-        begin, stop = control.now(), control.stop
+        begin, stop, decide = control.now(), control.stop, control.decide or Decisions(problem.seed)
         end, history = begin + self.seconds, list(self.before)
         plan = FinishPlan(0, 0.0)
         if self.method.finish_sweeps:
@@ -157,7 +158,7 @@ class FinalFit(Iterative):
         tell(self.fit.finish(max(end - plan.seconds - control.now(), 0.0), on_progress))
         volume, gaussians, reached, sweeps = self.fit.snapshot(problem.grid), self.fit.gaussians, history[-1], 0
         if plan.sweeps != 0 and gaussians is not None and not stop():
-            late = replace(control.by(end), stop_trials=None if plan.trials else lambda: True)
+            late = replace(control.by(end), decide=decide, stop_trials=None if plan.trials else lambda: True)
             if problem.wide:
                 # Gaussians that learnt while views came leave the offset of the middle open: -2 dB on grains.
                 made = FistaTv().run(problem, late)
@@ -179,6 +180,7 @@ class FinalFit(Iterative):
             "finish": sweeps,
             "seconds_after_scan": control.now() - begin,
             "gaussians": reached.n_gaussians,
+            **decide.settings,
         }
         seconds = control.now() - self.began
         return Reconstruction(volume, settings, history, gaussians, method=self.method.name, seconds=seconds)

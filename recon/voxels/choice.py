@@ -107,6 +107,12 @@ class TrialChoice(NamedTuple):
         return None if self.best is None else self.tried[self.best]
 
     @property
+    def few_materials(self) -> bool:
+        """Whether few materials predict views held out better than total variation: costlier candidates, which know of
+        no levels, are then not tried, to save the time."""
+        return any(each.prior and each.prior.materials and each.prior.materials.levels for each in self.predictions)
+
+    @property
     def at(self) -> int | None:
         """Number of the first candidate, and so the simplest, that the best does not beat; None: none was tried."""
         if (least := self.least) is None:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32
+from recon.base.decisions import Decisions
 from recon.base.empirical import ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, RunControl
@@ -33,11 +34,13 @@ def choice_sweeps(geometry: Geometry) -> float:
     return CHOICE_SWEEPS * share if geometry.n_views >= LEAST_VIEWS else 0.0
 
 
-def predicted_views(method: Method, views: Views, grid: Grid, one_in: int) -> tuple[NDArray[np.intp], F32]:
+def predicted_views(
+    method: Method, views: Views, grid: Grid, one_in: int, decide: Decisions | None = None
+) -> tuple[NDArray[np.intp], F32]:
     """Numbers of the held-out views, and their images [view, row, col] predicted by a volume of the others.
 
     They are those of `split_views`, but for a turn whatever the axis: geometries are compared by the same views.
     """
     seen, unseen = split_views(views.geometry, one_in, 2 * np.pi)
-    volume = method.run(ReconProblem(views.select(seen), grid), RunControl()).volume
+    volume = method.run(ReconProblem(views.select(seen), grid), RunControl(decide=decide)).volume
     return unseen, Projector(views.geometry.select(unseen), grid).forward(volume.data)

@@ -22,6 +22,7 @@ from recon.voxels.iterative import TV_WEIGHT_CHOSEN, VoxelMethod
 from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct
 from recon.voxels.trial import PATCH_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import (
+    NORM,
     Buffers,
     Momentum,
     TotalVariationProx,
@@ -87,8 +88,9 @@ class FistaTv(VoxelMethod):
         if self.tv_weight is None:
             weight = choose_weight(problem, x, self.iterations, trial)
         else:
-            share, plain = self.tv_weight, projector.plain
-            weight = problem.decide("weight", lambda: share * unit * largest_eigenvalue(plain, problem.weight))
+            share, rays = self.tv_weight, problem.weight
+            norm = problem.decide(NORM, lambda: largest_eigenvalue(projector.plain, rays))
+            weight = problem.decide("weight", lambda: share * unit * norm)
         subsets = Subsets.of(problem, self.subsets, FEWEST_SUBSETS)
         x = ordered_fista(problem, x, weight, subsets, sweeps=self.iterations, tv_steps=self.tv_steps)
         if self.tv_weight is None and unit > 0:
@@ -205,13 +207,10 @@ class PnpDct(VoxelMethod):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction with the best threshold; with one of its own that of the method's volume.
 
-        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.prior`; nor where few
-        materials predict the views better than total variation, to save the time.
+        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.prior`.
         """
-        few = any(each.prior and each.prior.materials and each.prior.materials.levels for each in so_far.predictions)
-        if self.patch_threshold is None and so_far.tried and (few or trial.settings.wide):
-            where = "few materials predict the views" if few else "the sample is wider than the field"
-            return Prediction(self.name, remark=f"{self.name} not tried, as {where}")
+        if self.patch_threshold is None and so_far.tried and trial.settings.wide:
+            return Prediction(self.name, remark=f"{self.name} not tried, as the sample is wider than the field")
         if self.patch_threshold is not None or trial.prior is None or not trial.prior.strength:
             return trial.predicted(self)
         return trial.prediction(self.name, trial.residuals_of_patches(trial.prior.strength), trial.prior)

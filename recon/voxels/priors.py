@@ -24,6 +24,7 @@ from recon.base.empirical import (
 )
 from recon.base.geometry import Geometry
 from recon.base.noise import noise_beside_structure
+from recon.base.registry import MethodEntry, in_folders
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.devices import LineProjector, projector_on, voxel_device
 from recon.voxels.projector import Projector
@@ -154,6 +155,10 @@ class Subsets:
 
 RENEWED = 2
 """Sweeps after which the volume is made anew towards which steps are pulled."""
+
+
+# Methods with a pull that views held out may prefer, also after the sweeps of a fit, see `Discrete`.
+PULLS: dict[str, MethodEntry] = in_folders("recon.features", "PULLS")
 
 
 class Pull(Protocol):

@@ -293,7 +293,8 @@ class Trial:
         """Which candidate predicts the views held out; one that does not take them is not tried.
 
         A candidate is run as it is, on the views that are not held out, unless it has a method `predict`, which tells
-        its residuals by a part of the work.
+        its residuals by a part of the work; after few materials that predict these views it is not run, unless the best
+        is asked for.
 
         Args:
             candidates: the simplest and cheapest first.
@@ -302,7 +303,11 @@ class Trial:
         choice = TrialChoice(self.settings.all_rows or f"{rows} rows", least_gain)
         for each in candidates:
             try:
-                prediction = each.predict(self, choice) if isinstance(each, Predicting) else self.predicted(each)
+                prediction = (
+                    Prediction(each.name, remark=f"{each.name} not tried, as few materials predict the views")
+                    if least_gain > 0 and choice.few_materials
+                    else each.predict(self, choice) if isinstance(each, Predicting) else self.predicted(each)
+                )  # fmt: skip
             except ValueError as error:
                 prediction = Prediction(each.name, remark=f"{each.name}: {error}")
             choice = choice.after(prediction)

@@ -159,7 +159,8 @@ def times_power(array: F32, power: int) -> F32:
     return array
 
 
-POWER_ROUNDS, POWER_ROWS = 6, 16  # of power iteration, and what it sees where rows are alike
+NORM = "norm"  # name of the decision on the largest eigenvalue, which does not depend on the data
+POWER_ROUNDS = 6  # of power iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -278,14 +279,14 @@ def largest_eigenvalue(projector: Projector, weight: F32 | None) -> float:
     For a matrix of non-negative entries and a positive x the largest (B x)_i / x_i bounds it from above (Collatz 1942).
     So the step 1 / bound is safe after any number of rounds. The Rayleigh quotient would err to the other side. A
     matched projector has negative entries: the bound is that of the plain one, times `Projector.gain`.
-    Where each row sees one slice, and all rows are alike, it is computed on sixteen rows.
+    Where each row sees one slice, and all rows are alike, it is computed on one row: a half to a fifth of the time.
     """
     geometry, slices = projector.geometry, projector.grid.shape[0]
     alike = weight is None and slices_are_rows(projector) and not (geometry.skew or geometry.width)
-    if alike and slices > POWER_ROWS:
-        some, grid = geometry.rows(0, POWER_ROWS), projector.grid
+    if alike and slices > 1:
+        some, grid = geometry.rows(0, 1), projector.grid
         centre = (Grid.matching(some).centre[0], *grid.centre[1:])
-        box = replace(grid, shape=(POWER_ROWS, *grid.shape[1:]), centre=centre)
+        box = replace(grid, shape=(1, *grid.shape[1:]), centre=centre)
         projector = replace(projector, geometry=some, grid=box)
     gain, projector, device = projector.gain(weight), projector.plain, voxel_device(projector.device)
     lines, (nz, ny, nx) = projector_on(device, projector), projector.grid.shape

@@ -5,11 +5,12 @@ adds what SCORES.json lacks, a volume at a time, and prints the tables of all ce
 one file at once. Peers take part where they are installed, see tests.bench.league.
 
 Scenes: see tests.bench.first_users_scenes. 16 rows, 8 from 2048 columns on. The noise is that of so many photons a
-pixel in the open beam; seeds are of the noise alone. "wide" is a peer's own way to a sample wider than the field:
-slices as wide as the sample, of whose width it is told.
+pixel in the open beam; seeds are of the noise alone, other packings of the sample have a number of their own. "wide"
+is a peer's own way to a sample wider than the field: slices as wide as the sample, of whose width it is told.
 
 dB: PSNR within 0.95 of the field's circle, over the largest density, values clipped at 0. Fraction: of voxels over half
-way between matrix and grains, inside the can's wall, over the true one's. Cracks: depth over the true
+way between matrix and grains, inside the can's wall, over the true one's. Wrong: share of these voxels that are on the
+other side of half way than the truth. Cracks: depth over the true
 one, of 0.5 to 1, 1 to 1.5 and 1.5 to 2 voxels, see `crack_depths`. CPU seconds are of the volume alone, on one thread
 by default; what compiles did so before. Memory: peak of the process, which makes this volume alone, with all that it
 imports.
@@ -53,7 +54,7 @@ from tests.bench.quality_cases import Case, rows_of
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Depths = tuple[float | None, float | None, float | None]
-VERSION = 2
+VERSION = 3
 """Of scenes and figures: scores of another one do not belong into the same table."""
 BESIDE, ACROSS, POINTS, FEWEST = 2.5, 0.6, 60, 15
 """Planes beside a plane, voxels away; disc over the plane's; points, and fewest."""
@@ -70,13 +71,14 @@ class Cell(NamedTuple):
     over: float
     photons: float
     seed: int
+    packing: int = 0
 
     @property
     def rows(self) -> int:
         return 8 if self.columns >= 2048 else 16
 
     def __str__(self) -> str:
-        return f"{self.scene}|{self.columns}|{self.views}|{self.over:g}|{self.photons:g}|{self.seed}"
+        return f"{self.scene}|{self.columns}|{self.views}|{self.over:g}|{self.photons:g}|{self.seed}|{self.packing}"
 
 
 class Score(NamedTuple):
@@ -84,6 +86,7 @@ class Score(NamedTuple):
 
     quality: float | None
     fraction: float | None
+    wrong: float | None
     thin: float | None
     medium: float | None
     thick: float | None
@@ -123,18 +126,19 @@ def crack_depths(volume: F32, truth: F32, planes: Planes) -> Depths:
     return thin, medium, thick
 
 
-def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float, float, *Depths]:
-    """dB, fraction of grains over the true one, and depths of cracks by width (all rows of such a scene only)."""
+def judged(volume: F32, scene: Scene, rows: Sequence[int]) -> tuple[float, float, float, *Depths]:
+    """dB, fraction of grains over the true one, share of wrong voxels, and depths of cracks by width (all rows of such
+    a scene only)."""
     volume, truth = np.maximum(volume, 0), scene.truth[list(rows)]
     x = np.arange(truth.shape[2]) - (truth.shape[2] - 1) / 2
     away, field = np.hypot(x[:, None], x), 0.95 * truth.shape[2] / 2
     error = np.mean(np.square(volume - truth, dtype=np.float64)[:, away < field])
     inside, half_way = away < min(field, scene.inner - 2), sum(scene.levels) / 2
-    fraction = np.mean(volume[:, inside] > half_way) / np.mean(truth[:, inside] > half_way)
+    made, true = (each[:, inside] > half_way for each in (volume, truth))
     whole = scene.planes is not None and len(rows) == len(scene.truth)
     depths = crack_depths(volume, truth, scene.planes) if whole and scene.planes else (None, None, None)
     quality = 10 * math.log10(float(scene.truth.max()) ** 2 / error)
-    return quality, float(fraction), *depths
+    return quality, float(made.mean() / true.mean()), float((made != true).mean()), *depths
 
 
 def noisy(cell: Cell, scene: Scene) -> F32:
@@ -162,7 +166,7 @@ def _child(name: str, value: Value, over: float, case: Case, limit: float, into:
 
 def play(cell: Cell, name: str, value: Value, limit: float) -> Score | None:
     """One volume in a process of its own; None: it failed, as stderr says."""
-    scene = scene_of(cell.scene, cell.columns, cell.rows, cell.over, cell.views)
+    scene = scene_of(cell.scene, cell.columns, cell.rows, cell.over, cell.views, cell.packing)
     rows, views = list(range(cell.rows)), noisy(cell, scene)
     case = Case(cell.scene, views, scene.geometry, Grid.matching(scene.geometry), np.empty((cell.rows, 0, 0), "f4"), 1)
     if ENTRANTS[name].of(value, cell.over).slice_by_slice and scene.planes is None:
@@ -176,7 +180,7 @@ def play(cell: Cell, name: str, value: Value, limit: float) -> Score | None:
         theirs.close()
         process.join()
         if process.exitcode == -signal.SIGXCPU:
-            return Score(None, None, None, None, None, limit, 0.0)
+            return Score(*[None] * 6, limit, 0.0)
         if process.exitcode:
             print(f"{cell} {name}: ended with status {process.exitcode}", file=sys.stderr, flush=True)
             return None
@@ -207,9 +211,9 @@ class Kept:
             parts = key.split("|")
             numbers = isinstance(row, list) and all(isinstance(x, int | float) for x in row if x is not None)
             good = (
-                len(parts) == 8
+                len(parts) == 9
                 and parts[0] in SCENES
-                and parts[6] in ENTRANTS
+                and parts[7] in ENTRANTS
                 and numbers
                 and len(row) == len(Score._fields)
             )
@@ -274,7 +278,9 @@ def play_all(kept: Kept, cells: Sequence[Cell], names: Sequence[str], best: bool
             made = kept.score(cell, name, value, limit)
             return -math.inf if made is None or made.quality is None else made.quality
 
-        first = cell._replace(seed=next(other.seed for other in cells if other[:5] == cell[:5]))
+        first = cell._replace(
+            seed=next(other.seed for other in cells if other[:5] == cell[:5] and other.packing == cell.packing)
+        )
         if first.seed == cell.seed:
             climb(quality, entrant.at)
         else:
@@ -295,6 +301,7 @@ def _shown(scores: Sequence[Score]) -> str:
     text = f"{statistics.median(quality):.2f}"
     text += f" ({min(quality):.2f} to {max(quality):.2f})" if len(quality) > 1 else ""
     text += f", {statistics.median(score.fraction or 0 for score in made):.2f}"
+    text += f", {100 * statistics.median(score.wrong or 0 for score in made):.1f} %"
     for depths in zip(*((score.thin, score.medium, score.thick) for score in made), strict=True):
         if known := [depth for depth in depths if depth is not None]:
             text += f", {statistics.median(known):.2f}"
@@ -305,10 +312,10 @@ def _shown(scores: Sequence[Score]) -> str:
 def tables(kept: Kept, cells: Sequence[Cell]) -> str:
     """Markdown: a table for each scene, size, width and number of photons; a column for each number of views."""
     lines: list[str] = []
-    for scene, columns, over, photons in dict.fromkeys((c.scene, c.columns, c.over, c.photons) for c in cells):
-        here = [c for c in cells if (c.scene, c.columns, c.over, c.photons) == (scene, columns, over, photons)]
+    for cell in dict.fromkeys(c._replace(views=0, seed=0) for c in cells):
+        here = [c for c in cells if c._replace(views=0, seed=0) == cell]
         views = list(dict.fromkeys(c.views for c in here))
-        where = f"{over:g} times as wide as the field" if over > 1 else "in the field"
+        where = f"{cell.over:g} times as wide as the field" if cell.over > 1 else "in the field"
         rows: list[str] = []
         for name, best in product(ENTRANTS, (False, True)):
             texts, memory = [], 0.0
@@ -324,7 +331,8 @@ def tables(kept: Kept, cells: Sequence[Cell]) -> str:
                 label = f"{name}, best" if best else name
                 rows.append(f"| {label} | " + " | ".join(texts) + f" | {memory:.0f} |")
         if rows:
-            lines += [f"{scene}, {columns} x {here[0].rows}, {where}, {photons:g} photons:", ""]
+            packing = f", packing {cell.packing}" if cell.packing else ""
+            lines += [f"{cell.scene}{packing}, {cell.columns} x {cell.rows}, {where}, {cell.photons:g} photons:", ""]
             lines += ["| | " + " | ".join(f"{n} views" for n in views) + " | MB |", "|---" * (len(views) + 2) + "|"]
             lines += [*rows, ""]
     return "\n".join(lines)
@@ -334,7 +342,8 @@ def main(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("scores", type=Path)
     lists = {"scenes": "cathode,packed,cracks,fringes", "columns": "512,1024,2048", "views": "45,90,180"}
-    lists |= {"over": "1,1.5", "photons": "1e4,1e5", "seeds": "1,2,3", "of": ",".join(ENTRANTS), "forget": ""}
+    lists |= {"over": "1,1.5", "photons": "1e4,1e5", "seeds": "1,2,3", "packings": "0"}
+    lists |= {"of": ",".join(ENTRANTS), "forget": ""}
     for name, default in lists.items():
         parser.add_argument(f"--{name}", default=default, help="parted by commas")
     parser.add_argument("--best", action="store_true", help="the best setting of each, too")
@@ -348,14 +357,14 @@ def main(arguments: Sequence[str]) -> None:
     for names, known in ((some["of"] + some["forget"], ENTRANTS), (some["scenes"], SCENES)):
         if wrong := [name for name in names if name not in known]:
             parser.error(f"there is no {', '.join(wrong)}; there are {', '.join(known)}")
-    kinds = {"columns": int, "views": int, "over": float, "photons": float, "seeds": int}
+    kinds = {"columns": int, "views": int, "over": float, "photons": float, "seeds": int, "packings": int}
     numbers = [[kind(x) for x in some[name]] for name, kind in kinds.items()]
     cells = [Cell(scene, *values) for scene, *values in product(some["scenes"], *numbers)]
     try:
         kept = Kept(asked.scores)
         if some["forget"]:
             gone = set(some["forget"])
-            kept.change(lambda scores: {key: one for key, one in scores.items() if key.split("|")[6] not in gone})
+            kept.change(lambda scores: {key: one for key, one in scores.items() if key.split("|")[7] not in gone})
         if not asked.table:
             play_all(kept, cells, some["of"], asked.best, asked.limit)
     except ValueError as error:

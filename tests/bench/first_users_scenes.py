@@ -1,9 +1,11 @@
 """Scans of the first users' samples, whose truth is known: a packed can by exact chords, with cracks or without, and
-the simulator's cathode, with fringes or without.
+the simulator's cathode, with fringes or without; and the bodies of tests.bench.first_users_shapes.
 
 Lengths are in pixels of the detector, which are as wide as voxels, and densities in 1/pixel. A line integral is the
 mean of nine rays of a pixel. In the field a can is 0.96 times as wide as the field; wider cans are `over` times as
-wide. Of `packed` and `cracks` the darkest ray keeps exp(-2), the cathode keeps about a twentieth, for any width.
+wide. The darkest ray keeps exp(-2), of the cathode about a twentieth, for any width. Of the same cans as `packed`,
+`drift` moves across by a pixel during the scan, `rings` have pixels whose gains are off by 1 %, a few by 5 %,
+`hardening` is seen by two energies, and `cone` are ellipsoids in a cone beam from four widths of the field.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +31,7 @@ from simulators.effects.scattering.phase_fringes import PhaseFringes
 from simulators.frame.shot import Detector
 from simulators.light import Beam
 from simulators.samples.composed import build_sample
+from tests.bench import first_users_shapes as shapes
 from tests.simulators import shots
 
 F32 = NDArray[np.float32]
@@ -41,6 +44,9 @@ CRACKED, OFF, WIDTHS = 8.0, 0.3, (0.5, 2.0)
 """Least radius of a ball with a crack (of those, every second has one), its largest distance from the middle over the
 radius, and widths."""
 SUB, TRIES = 3, 4000
+MOVED, GAINS, FEW, SOFT, SOURCE = 1.0, (0.01, 0.05), 0.02, 0.3, 4.0
+"""Pixels of a drift, errors of most and of a few gains, share of these, attenuation of two energies over their mean,
+less and more, and distance of a cone's source over the columns."""
 PITCH, ENERGY, DISTANCE, DELTA_BETA, FIELD = 4.6e-3, 25.0, 30.0, 90.0, 0.96
 """Of the cathode: pixel in mm, keV, mm behind it and delta/beta of the fringes. FIELD: can over field where it fits."""
 
@@ -270,17 +276,24 @@ def _cracked(rng: np.random.Generator, bodies: Bodies, controls: int = 5) -> tup
     return bodies._replace(crack=cracks), planes
 
 
-def _packed(cols: int, rows: int, over: float, geometry: Geometry, with_cracks: bool) -> Scene:
-    rng, radius = np.random.default_rng([cols, rows, round(100 * over)]), can_radius(cols, over)
+def _packing_rng(cols: int, rows: int, over: float, packing: int) -> np.random.Generator:
+    return np.random.default_rng([cols, rows, round(100 * over), *([packing] if packing else [])])
+
+
+def _packed(
+    cols: int, rows: int, over: float, geometry: Geometry, packing: int, with_cracks: bool = False, moved: float = 0.0
+) -> Scene:
+    rng, radius = _packing_rng(cols, rows, over, packing), can_radius(cols, over)
     bodies, planes = packed_bodies(rng, radius - THICK, rows / 2 + LARGE), None
     if with_cracks:
         bodies, planes = _cracked(rng, bodies)
     u, v = (((np.arange(n * SUB) + 0.5) / SUB - n / 2) for n in (cols, rows))
-    outer, inner = (2 * np.sqrt(np.maximum(r**2 - u**2, 0)) for r in (radius, radius - THICK))
     clean = np.empty((geometry.n_views, rows, cols))
-    for view, angle in zip(clean, geometry.angles, strict=True):
+    for n, (view, angle) in enumerate(zip(clean, geometry.angles, strict=True)):
+        at = u + moved * (n / (geometry.n_views - 1) - 0.5)
+        outer, inner = (2 * np.sqrt(np.maximum(r**2 - at**2, 0)) for r in (radius, radius - THICK))
         lines = np.tile(WALL * (outer - inner) + MATRIX * inner, (v.size, 1))
-        _add_view(bodies, angle, u, v, lines)
+        _add_view(bodies, angle, at, v, lines)
         view[:] = lines.reshape(rows, SUB, cols, SUB).mean((1, 3))
     x, z = ((np.arange(n) - (n - 1) / 2) for n in (cols, rows))
     away = np.hypot(u[:, None], u)
@@ -294,18 +307,48 @@ def _packed(cols: int, rows: int, over: float, geometry: Geometry, with_cracks: 
     )
 
 
+def _shapes(
+    cols: int, rows: int, over: float, geometry: Geometry, packing: int, kind: str, densities: tuple[float, ...],
+    matrix: float = MATRIX,
+) -> Scene:  # fmt: skip
+    rng, radius = _packing_rng(cols, rows, over, packing), can_radius(cols, over)
+    half = rows / 2 * (1 + 1 / SOURCE if geometry.is_cone else 1) + LARGE
+    around = packed_bodies(rng, radius - THICK, half)
+    ball = around.plate[:, 4] >= around.radius
+    bodies = shapes.shapes_of(rng, kind, around.centre[ball], around.radius[ball], densities)
+    can = radius, radius - THICK, WALL, matrix
+    clean, truth = shapes.views_of(bodies, can, geometry), shapes.truth_of(bodies, can, rows, cols)
+    scale, levels = DEPTH / clean.max(), (matrix, matrix + float(bodies.density.mean()))
+    return Scene(
+        (scale * clean).astype(np.float32), truth * np.float32(scale), (scale * levels[0], scale * levels[1]),
+        radius - THICK, geometry,
+    )  # fmt: skip
+
+
+def _rings(cols: int, rows: int, over: float, geometry: Geometry, packing: int) -> Scene:
+    made, rng = _packed(cols, rows, over, geometry, packing), np.random.default_rng(packing)
+    share = np.where(rng.uniform(size=(rows, cols)) < FEW, GAINS[1], GAINS[0])
+    return replace(made, clean=made.clean + (share * rng.normal(size=(rows, cols))).astype(np.float32))
+
+
+def _hardening(cols: int, rows: int, over: float, geometry: Geometry, packing: int) -> Scene:
+    made = _packed(cols, rows, over, geometry, packing)
+    seen = -np.log((np.exp(-(1 - SOFT) * made.clean) + np.exp(-(1 + SOFT) * made.clean)) / 2)
+    return replace(made, clean=seen.astype(np.float32))
+
+
 def can_radius(cols: int, over: float) -> float:
     """Outer radius in pixels of a can `over` times as wide as the field; over 1: of one that fits."""
     return cols / 2 * (over if over > 1 else FIELD)
 
 
-def _cathode(cols: int, rows: int, over: float, geometry: Geometry, fringes: bool) -> Scene:
+def _cathode(cols: int, rows: int, over: float, geometry: Geometry, packing: int, fringes: bool) -> Scene:
     """The simulator's, whose lengths grow with the columns; a wider one has more grains of the same size."""
     text = (Path(__file__).parents[2] / "configs" / "scenes" / "cathode.yaml").read_text(encoding="utf-8")
     keys = yaml.safe_load(text)["phantom"]
     factor = 2 * can_radius(cols, 1) * PITCH / keys["diameter"]
     larger = {name: factor * value for name, value in keys.items() if name.endswith("_um") or name == "height"}
-    keys |= {**larger, "diameter": 2 * can_radius(cols, over) * PITCH}
+    keys |= {**larger, "diameter": 2 * can_radius(cols, over) * PITCH, "seed": keys["seed"] + packing}
     sample, edge = build_sample("phantom", keys, Beam(1e5)), 2  # rows beyond, whose light the fringes move
     detector = Detector.centred(((rows + 2 * edge) * SUB, cols * SUB), PITCH / SUB)
     effect = PhaseFringes(DELTA_BETA, DISTANCE, ENERGY, method="transport")
@@ -320,29 +363,43 @@ def _cathode(cols: int, rows: int, over: float, geometry: Geometry, fringes: boo
     return Scene(clean, truth, (0.15 * grey, 2.2 * grey), inner, geometry)
 
 
-SCENES: dict[str, Callable[[int, int, float, Geometry], Scene]] = {
+SCENES: dict[str, Callable[[int, int, float, Geometry, int], Scene]] = {
     "cathode": partial(_cathode, fringes=False),
-    "packed": partial(_packed, with_cracks=False),
+    "packed": _packed,
     "cracks": partial(_packed, with_cracks=True),
     "fringes": partial(_cathode, fringes=True),
+    "drift": partial(_packed, moved=MOVED),
+    "rings": _rings,
+    "hardening": _hardening,
+    "ellipsoids": partial(_shapes, kind="ellipsoids", densities=(0.65,)),
+    "polyhedra": partial(_shapes, kind="polyhedra", densities=(0.35, 0.7)),
+    "pores": partial(_shapes, kind="ellipsoids", densities=(-0.85,), matrix=0.85),
+    "cone": partial(_shapes, kind="ellipsoids", densities=(0.65,)),
 }
 MOST = 180  # views of a scan that is kept; 90 and 45 are every second and fourth
 
 
-def scene_of(name: str, cols: int, rows: int, over: float, views: int) -> Scene:
-    """A scene's views over half a turn, from the folder for temporary files if it was made before by the same code."""
+def scene_of(name: str, cols: int, rows: int, over: float, views: int, packing: int = 0) -> Scene:
+    """A scene's views over half a turn (a cone's: a turn), from the folder for temporary files if it was made before by
+    the same code."""
     every = MOST // views if MOST % views == 0 else 1
-    geometry = Geometry.parallel(np.arange(views * every) * np.pi / (views * every), (rows, cols))
-    code = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]
-    kept = Path(tempfile.gettempdir()) / "first_users" / f"{name}_{cols}x{rows}_{over:g}_{geometry.n_views}_{code}.npz"
-    if not kept.exists():
-        made = SCENES[name](cols, rows, over, geometry)
+    angles, shape = np.arange(views * every) * np.pi / (views * every), (rows, cols)
+    source = SOURCE * cols
+    geometry = (
+        Geometry.cone(2 * angles, shape, 1.0, source, source) if name == "cone" else Geometry.parallel(angles, shape)
+    )
+    files = Path(__file__), Path(str(shapes.__file__))
+    code = hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+    kept = f"{name}_{cols}x{rows}_{over:g}_{geometry.n_views}_{packing}_{code}.npz"
+    path = Path(tempfile.gettempdir()) / "first_users" / kept
+    if not path.exists():
+        made = SCENES[name](cols, rows, over, geometry, packing)
         planes = {} if made.planes is None else {f"plane_{key}": value for key, value in vars(made.planes).items()}
-        kept.parent.mkdir(exist_ok=True)
-        part = kept.with_suffix(f".{os.getpid()}.npz")
+        path.parent.mkdir(exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}.npz")
         np.savez(part, clean=made.clean, truth=made.truth, levels=made.levels, inner=made.inner, **planes)
-        part.replace(kept)
-    with np.load(kept) as file:
+        part.replace(path)
+    with np.load(path) as file:
         planes = {key[6:]: file[key] for key in file.files if key.startswith("plane_")}
         matrix, grains = file["levels"].tolist()
         return Scene(

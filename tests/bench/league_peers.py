@@ -229,6 +229,7 @@ LEAGUE: dict[str, Competitor] = {
         ("default", recon.PnpDct()),
         *((f"threshold {value:g}", recon.PnpDct(patch_threshold=value)) for value in THRESHOLDS),
     ),
+    "splatline discrete": _ours(("default", recon.Discrete())),
     "splatline r2": _ours(("default", recon.R2())),
     "splatline auto": _ours(("default", recon.Auto())),
     "scikit-image": Competitor(

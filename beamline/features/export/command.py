@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -26,6 +26,7 @@ from beamline.cli.recipe import Repeatable, names_given
 from beamline.cli.terminal import answering
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import atomic_file, refuse_existing
+from beamline.core.quantities import VoxelKind
 from beamline.core.text import count, size
 from beamline.storage.volumes import suffixes_text
 from recon.base.views import spread
@@ -81,6 +82,13 @@ class ExportRequest:
         is_flag=True,
         help="Write displacement, roll and tilt of the volume's views as a .csv that --poses reads.",
     )
+    material: int | None = set_by(
+        "--material",
+        type=WholeRange(min=1),
+        metavar="K",
+        help="Of a volume pulled to few materials: in place of its density each voxel's probability of being material "
+        "K. 1 is the least dense one.",
+    )
     at: int | None = set_by(
         "--at", type=WholeRange(min=0), metavar="K", help="Volume K of a time series, counted from 0."
     )
@@ -119,8 +127,10 @@ def _part_asked_for(request: ExportRequest) -> Callable[[Path, Path, bool], None
             raise click.UsageError(f"-o {request.output}: {name} needs the suffix {suffix}; voxels need another one.")
     for name, (wanted, _, export_part) in parts.items():
         if wanted:
-            if request.bits != "32" or any(x is not None for x in (request.window, request.dataset, request.at)):
-                raise click.UsageError(f"{name} does not go with --bits, --window, --at or --dataset.")
+            if request.bits != "32" or any(
+                x is not None for x in (request.window, request.dataset, request.at, request.material)
+            ):
+                raise click.UsageError(f"{name} does not go with --bits, --window, --material, --at or --dataset.")
             return export_part
     return None
 
@@ -146,6 +156,8 @@ def _export_voxels(request: ExportRequest) -> None:
                     f"{request.volume} holds grey values of a window, not the volume itself. Export the volume it was "
                     "made of."
                 )
+            if request.material is not None:
+                record = _of_material(record, request.material)
             if pixels.bits < 32 and request.window is None:
                 raise ConfigError(f"--bits {request.bits} needs --window LOW:HIGH. {_suggestion(record)}")
             clipped = write_volume(request.output, record, pixels)
@@ -159,6 +171,28 @@ def _export_voxels(request: ExportRequest) -> None:
             f"volume   {' x '.join(map(str, shape))}, {size(math.prod(shape) * pixels.dtype.itemsize)}",
             *([] if window is None else [f"window   {window[0]:g} to {window[1]:g}; {outside}"]),
         )
+
+
+def _of_material(record: ReconRecord, number: int) -> ReconRecord:
+    """The volume of each voxel's probability to be of a material; in memory, one volume for each material and two.
+
+    Raises:
+        DataError: it has no such material.
+    """
+    from recon.base.registry import loaded
+    from recon.base.volume import Volume
+    from recon.voxels.priors import PULLS
+
+    pulled: Any = next(getattr(loaded(entry.module), entry.cls) for entry in PULLS.values())
+    shares = None if record.kind is VoxelKind.SHARE else pulled.probabilities(record.volume, record.settings)
+    if shares is None:
+        raise DataError(
+            "--material: this volume was not pulled to few materials. Discrete and the finish of r2 do so where views "
+            "held out prefer it; the record then has levels_of_materials. Nothing was written."
+        )
+    if number > len(shares):
+        raise DataError(f"--material {number}: this volume has materials 1 to {len(shares)}. Nothing was written.")
+    return replace(record, volume=Volume(shares[number - 1], record.grid), kind=VoxelKind.SHARE)
 
 
 def _export_gaussians(volume: Path, output: Path, as_json: bool) -> None:

@@ -8,3 +8,4 @@ METHODS = {
     )
 }
 CANDIDATES = {"discrete": 1.5}
+PULLS = METHODS

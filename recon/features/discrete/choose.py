@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from recon.base.arrays import F64
 from recon.base.decisions import MaterialPrior
 from recon.base.empirical import ONE_IN
-from recon.features.discrete.mixture import MaterialPull, fitted_levels
+from recon.features.discrete.mixture import LEAST_NOISE, NOISE, MaterialPull, are_apart, fitted_levels
 from recon.voxels.choice import LEAST_GAIN, significantly_better
 from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem
@@ -93,9 +93,10 @@ class MaterialTrial:
             if self._levels is None
             else (np.array(self._levels), np.full(count, 1 / count))
         )
-        if self._trial.ended or not np.diff(levels).min() > 0:
+        if self._trial.ended or not are_apart(levels):
             return np.full(self.smooth.shape, np.inf), MaterialPrior()
         first = MaterialPrior(tuple(levels.tolist()), tuple(weights.tolist()), tv_share, pull)
-        towards = MaterialPull(first, self._where, follows=self._levels is None)
+        none_thin, noise = np.broadcast_to(np.int8(0), self._start.shape), min(NOISE, LEAST_NOISE / math.sqrt(tv_share))
+        towards = MaterialPull(first, self._where, none_thin, noise, follows=self._levels is None)
         x = self._trial.volume_of_weight(self._weight * tv_share, self._start, self._sweeps, towards)
         return self._trial.residuals(x), towards.materials_in(x)

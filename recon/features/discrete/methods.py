@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any, ClassVar, Self
@@ -10,12 +11,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.decisions import Decisions, GoesOn, MaterialPrior, Prior
+from recon.base.decisions import GoesOn, MaterialPrior, Prior
 from recon.base.empirical import FEWEST_SUBSETS
-from recon.base.method import Plain, ReconProblem, Reconstruction, RunControl
+from recon.base.method import Plain
 from recon.base.setting import Count
+from recon.base.volume import Volume
 from recon.features.discrete.choose import PULLS, MaterialTrial, in_field
-from recon.features.discrete.mixture import MaterialPull, probabilities
+from recon.features.discrete.mixture import MaterialPull, probabilities, thin_parts, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
@@ -26,8 +28,8 @@ from recon.voxels.trial import SUBSETS, TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
 MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
-"""Names of the decisions on the materials, in the units of the scan, and on the share of voxels that are more likely
-partial than of one material; and how settings end that state the materials."""
+"""Names of the decisions on the materials, in the units of the scan, and on the expected share of voxels on the wrong
+side of half way between two; and how settings end that state the materials."""
 _TRIALS = 6  # trials of materials, as a rule
 
 
@@ -51,7 +53,7 @@ class Discrete(VoxelMethod):
     takes: ClassVar[frozenset[str]] = frozenset({"device"})
     halo: ClassVar[int] = FistaTv.halo + 12
     error_bars: ClassVar[tuple[float, float] | None] = 2.2, 0.1
-    buffers: ClassVar[Buffers] = Buffers(9.3, 3.0, 4.8, filtered=True)
+    buffers: ClassVar[Buffers] = Buffers(9.6, 3.0, 4.8, filtered=True)
     first_sweeps: ClassVar[int] = FistaTv.iterations
 
     iterations: Count = 16
@@ -67,6 +69,16 @@ class Discrete(VoxelMethod):
     def trial_sweeps(self) -> int:
         """Sweeps for the weight of total variation, and with materials."""
         return CHOICE_SWEEPS + _TRIALS * self.iterations
+
+    @classmethod
+    def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
+        """[material, z, y, x] probability that a voxel is of one material, in ascending order; None: the volume, which
+        has these settings, was not pulled to few materials. What is missing to 1 is that of a partial voxel."""
+        given: list[Any] = [settings.get(name + _OF, ()) for name in MaterialPrior._fields]
+        if not len(given[0]):
+            return None
+        of_lines = probabilities(volume_lines(volume.data), MaterialPrior(*given))
+        return np.ascontiguousarray(of_lines.transpose(0, 3, 1, 2))
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
@@ -88,41 +100,48 @@ class Discrete(VoxelMethod):
             return FistaTv(iterations=self.iterations).iterate(problem, x)
         first, trial = GoesOn(problem.go_on), cache(partial(Trial.of, problem))
         x, weight = FistaTv().with_weight(replace(problem, go_on=first), x, trial)
+        materials = self.materials(problem, weight, trial)
+        if materials is None or not first.going:
+            return x
+        return self.pulled(problem, x, weight, materials, self.first_sweeps)
+
+    def materials(
+        self, problem: VoxelProblem, weight: NoiseBalance | float, trial: Callable[[], Trial | None]
+    ) -> MaterialPrior | None:
+        """In the units of the problem; None where few materials do not predict the views held out. Decided once.
+
+        Args:
+            weight: of total variation.
+            trial: of the problem.
+        """
         density = problem.units.density
         kept: list[Any] = problem.decide(
             MATERIALS, lambda: [*self._materials(problem, weight, trial()).scaled(density)]
         )
         materials = MaterialPrior(*kept).scaled(-density)
-        if not (materials.levels and first.going):
-            return x
-        where = in_field(problem)
-        further = replace(problem, go_on=lambda sweep, left: problem.go_on(self.first_sweeps + sweep, left))
+        return materials if materials.levels else None
+
+    def pulled(
+        self, problem: VoxelProblem, x: F32, weight: NoiseBalance | float, materials: MaterialPrior, done: int
+    ) -> F32:
+        """The volume x [y, x, z] after `iterations` passes with a pull to the materials, `done` passes before."""
+        where, thin = in_field(problem), thin_parts(x, materials)
+        further = replace(problem, go_on=lambda sweep, left: problem.go_on(done + sweep, left))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
         subsets = Subsets.of(problem, SUBSETS, FEWEST_SUBSETS)
         x = ordered_fista(
             further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS,
-            pull=MaterialPull(materials, where),
+            pull=MaterialPull(materials, where, thin),
         )  # fmt: skip
-        problem.decide(UNDECIDED, lambda: float(np.mean(probabilities(x, materials).max(0)[where] <= 0.5)))
+        share = problem.decide(UNDECIDED, lambda: undecided_share(x[where], materials))
+        of_scan = materials.scaled(problem.units.density)._asdict()
+        problem.decide.settings |= {UNDECIDED: share, **{name + _OF: value for name, value in of_scan.items()}}
         return x
-
-    def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
-        """The volume; its settings have the materials, and the share of voxels that are none of them for certain.
-
-        Raises:
-            ValueError: as `solve`.
-        """
-        decide = control.decide or Decisions(problem.seed)
-        result = super().run(problem, replace(control, decide=decide))
-        materials = MaterialPrior(*decide.made.get(MATERIALS, [()])[-1])
-        found = {name + _OF: value for name, value in materials._asdict().items()}
-        share = {UNDECIDED: decide.made[UNDECIDED][-1]} if UNDECIDED in decide.made else {}
-        return replace(result, settings={**result.settings, **(found if materials.levels else {}), **share})
 
     def _materials(self, problem: VoxelProblem, weight: NoiseBalance | float, trial: Trial | None) -> MaterialPrior:
         """In the units of the problem; without levels where few materials do not predict the views held out."""
-        if problem.prior is not None and problem.prior.materials is not None:
-            return problem.prior.materials
+        if problem.prior is not None:
+            return problem.prior.materials or MaterialPrior()
         if trial is None or isinstance(weight, NoiseBalance):
             levels = self.levels or ()
             weights = tuple(1 / len(levels) for _ in levels)
@@ -135,18 +154,3 @@ class Discrete(VoxelMethod):
         found = MaterialTrial(trial, weight, self.iterations, levels)
         found.choose()
         return found
-
-
-def probabilities_of(result: Reconstruction) -> F32:
-    """[material, z, y, x] probability that a voxel of a volume of `Discrete` is of one material, in ascending order.
-
-    What is missing to 1 is that of a partial voxel.
-
-    Raises:
-        ValueError: the volume was not pulled to few materials.
-    """
-    given: list[Any] = [result.settings.get(name + _OF) for name in MaterialPrior._fields]
-    if not given[0]:
-        raise ValueError("the volume has no materials: views held out did not prefer them; nothing was computed")
-    found = probabilities(volume_lines(result.volume.data), MaterialPrior(*given))
-    return np.ascontiguousarray(found.transpose(0, 3, 1, 2))

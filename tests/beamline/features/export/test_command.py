@@ -14,6 +14,7 @@ import tifffile
 
 from beamline.storage.volumes.base import bare_record
 from beamline.storage.volumes.files import opened_volume, write_volume
+from recon.base.decisions import MaterialPrior
 from tests.beamline.cli.small_scan import beamline
 
 VALUES = np.linspace(-0.1, 1.1, 60, dtype=np.float32).reshape(3, 4, 5)
@@ -55,6 +56,22 @@ def test_grey_values_say_what_was_clipped(volume: Path) -> None:
     grey = tifffile.imread(volume / "g.tif")
     assert grey.dtype == np.uint8
     assert np.abs(grey / 255 - np.clip(VALUES, 0, 1)).max() <= 0.5 / 255 + 1e-6
+
+
+def test_probabilities_of_a_material(folder: Path) -> None:
+    """Of a volume at two levels a tenth apart, with noise in each."""
+    values = np.where(np.arange(512).reshape(8, 8, 8) % 8 < 4, 0.1, 0.2).astype(np.float32)
+    known = dict(zip(MaterialPrior._fields, ((0.1, 0.2), (0.5, 0.5), 1.0, 0.02), strict=True))
+    settings = {f"{name}_of_materials": np.array(value) for name, value in known.items()}
+    record = bare_record(folder / "scan.h5", values, (0.5, 0.5, 0.5))
+    write_volume(folder / "v.h5", replace(record, parameters={"method": "discrete", **settings}))
+    assert beamline("export", "v.h5", "-o", "p.h5", "--material", "2").exit_code == 0
+    with opened_volume(folder / "p.h5") as read:
+        inside = read.volume.data[:][:, :, 6]
+        assert read.unit == "" and inside.min() > 0.5 and read.volume.data[:][:, :, 1].max() < 0.1
+    for name, number, said in (("v.h5", "3", "materials 1 to 2"), ("p.h5", "1", "not pulled to few materials")):
+        refused = beamline("export", name, "-o", "q.h5", "--material", number)
+        assert refused.exit_code == 5 and said in refused.stderr
 
 
 @pytest.mark.parametrize(

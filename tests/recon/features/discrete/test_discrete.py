@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 import recon
 from recon.base.decisions import Decisions
-from recon.features.discrete.methods import UNDECIDED, probabilities_of
+from recon.features.discrete.methods import UNDECIDED
 from recon.voxels.methods import PnpDct
 from recon.voxels.projector import Projector
 
@@ -65,8 +65,8 @@ def test_grains_of_two_materials_are_nearer_to_the_truth(of_grains: recon.Recons
 
 @pytest.mark.slow
 def test_the_probability_of_each_material_is_there_on_demand(of_grains: recon.Reconstruction) -> None:
-    p, truth = probabilities_of(of_grains), grains()
-    assert p.shape == (2, *GRID.shape)
+    p, truth = recon.Discrete.probabilities(of_grains.volume, of_grains.settings), grains()
+    assert p is not None and p.shape == (2, *GRID.shape)
     assert p[1][truth == 0.05].mean() > 3 * p[1][truth == 0.015].mean()
 
 
@@ -76,16 +76,24 @@ def test_smooth_matter_is_that_of_total_variation() -> None:
     found = recon.reconstruct(data, VIEWS, recon.Discrete())
     np.testing.assert_array_equal(found.volume.data, recon.reconstruct(data, VIEWS, recon.FistaTv()).volume.data)
     assert "levels_of_materials" not in found.settings
-    with pytest.raises(ValueError, match="no materials"):
-        probabilities_of(found)
+    assert recon.Discrete.probabilities(found.volume, found.settings) is None
 
 
 @pytest.mark.slow
-def test_auto_takes_it_for_grains_and_does_not_try_patches() -> None:
-    found = recon.reconstruct(measured(grains()), VIEWS, recon.Auto((recon.FistaTv(), recon.Discrete(), PnpDct())))
+def test_auto_takes_it_for_grains_and_tries_neither_patches_nor_a_fit() -> None:
+    candidates = recon.FistaTv(), recon.Discrete(), PnpDct(), recon.R2()
+    found = recon.reconstruct(measured(grains()), VIEWS, recon.Auto(candidates))
     assert found.method == "discrete"
-    assert "pnp-dct not tried" in found.settings["chosen_because"]
+    assert all(f"{name} not tried" in found.settings["chosen_because"] for name in ("pnp-dct", "r2"))
     assert "levels_of_materials" in found.settings
+
+
+@pytest.mark.slow
+def test_the_finish_of_a_fit_pulls_to_them_too() -> None:
+    made = [recon.reconstruct(measured(grains()), VIEWS, recon.R2(steps=60, finish=n)) for n in (None, 8)]
+    few, smooth = (error(each.volume.data, grains()) for each in made)
+    assert few < 0.8 * smooth
+    assert ["levels_of_materials" in each.settings for each in made] == [True, False]
 
 
 @pytest.mark.slow
