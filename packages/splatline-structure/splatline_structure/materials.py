@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,4 +113,4 @@ def probabilities(volume: F32, thresholds: F64, deviation: F32 | float) -> F32:
     """
     below = [ndtr((threshold - volume) / deviation) for threshold in thresholds]
     edges = [np.zeros_like(volume), *below, np.ones_like(volume)]
-    return np.stack([high - low for low, high in zip(edges, edges[1:], strict=False)]).astype(np.float32)
+    return np.stack([high - low for low, high in pairwise(edges)]).astype(np.float32)
