@@ -76,7 +76,9 @@ class Seen:
 @click.option(
     "--neck",
     type=click.FloatRange(min=0),
-    help="Parts that touch are one particle where the neck is this share of the narrower part, or wider. Default: 0.8.",
+    default=0.8,
+    show_default=True,
+    help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: always.",
 )
 @click.option(
     "--side",
@@ -121,19 +123,29 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
 
 def _seen(path: Path, answer: Answer, **values: Any) -> Seen:
     """One volume, and what was found in it."""
+    from splatline_structure.volumes import read_volume
+
+    record = read_volume(path, values["dataset"], values["voxel_um"], values["slices"])
+    return measured(path, record, answer, **values)
+
+
+def measured(path: Path, record: Any, answer: Answer, **values: Any) -> Seen:
+    """What was found in the volume of a record.
+
+    Raises:
+        ConfigError: a material that is not there. ValueError: no contrast, or parts of other shapes.
+    """
     import numpy as np
 
-    from recon.base.choices import NECK
     from splatline_structure.intervals import found_in
     from splatline_structure.numbers import Rules
-    from splatline_structure.volumes import box_in, read_volume
+    from splatline_structure.volumes import box_in
 
     count, particles = values["materials"], values["particles"] or values["materials"]
     if max(particles, values["through"]) > count:
         raise ConfigError(
             f"Material {max(particles, values['through'])} of {count}: they are numbered from 1. Nothing was written."
         )
-    record = read_volume(path, values["dataset"], values["voxel_um"], values["slices"])
     box = box_in(record.volume.data, values["crop"] == "square")
     grid, volume = record.grid.part(*box), np.ascontiguousarray(record.volume.data[box])
     first, end = values["slices"] or (0, None)
@@ -142,13 +154,10 @@ def _seen(path: Path, answer: Answer, **values: Any) -> Seen:
         if part[first:end].shape != record.volume.data.shape:
             raise ValueError(f"a part of its views has {part.shape} voxels")
         parts.append(np.ascontiguousarray(part[first:end][box]))
-    rules = Rules(
-        particles, values["through"], values["radius"], values["smallest"], values["neck"] or NECK, values["side"]
-    )
-    spacing = tuple(1e3 * edge for edge in record.grid.spacing)
-    return Seen(
-        path, record, grid, volume, found_in(volume, parts, count, spacing, rules, answer.counting("structures"))
-    )  # type: ignore[arg-type]
+    rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
+    dz, dy, dx = (1e3 * edge for edge in grid.spacing)
+    found = found_in(volume, parts, count, (dz, dy, dx), rules, answer.counting("structures"))
+    return Seen(path, record, grid, volume, found)
 
 
 def _parts(path: Path, record: Any, answer: Answer, **values: Any) -> list[Any]:

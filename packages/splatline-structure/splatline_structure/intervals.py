@@ -100,45 +100,46 @@ def found_in(
     Raises:
         ValueError: no contrast between materials.
     """
-    steps = 4 + len(parts)
+    steps, why = 4 + len(parts), ""
     tell(0, steps)
     materials = materials_of(volume, count)
     gaps = np.diff(materials.levels)
     whole = structure_of(volume, materials.thresholds, spacing, rules)
     tell(1, steps)
-    others = [materials_of(part, count) for part in parts]
-    halves = tuple(structure_of(v, each.thresholds, spacing, rules) for v, each in zip(parts, others, strict=True))
-    tell(1 + len(parts), steps)
+    halves, moved = [], [0.0] * (not parts)
+    for part in parts:
+        try:
+            thresholds = materials_of(part, count).thresholds
+        except ValueError:
+            why = "half of the views show no contrast between the materials: more views or photons are needed"
+            thresholds = materials.thresholds
+        moved.append(float(np.abs((thresholds - materials.thresholds) / gaps).max()))
+        halves.append(structure_of(part, thresholds, spacing, rules))
+        tell(1 + len(halves), steps)
     sides = []
     for sign in (1, -1):
         sides.append(structure_of(volume, materials.thresholds + sign * PROBED * gaps, spacing, rules).numbers)
-        tell(2 + len(parts) + len(sides) - 1, steps)
-    wide = coarse(volume)
-    rough = structure_of(
-        wide,
-        materials_of(wide, count).thresholds,
-        tuple(2 * edge for edge in spacing),
-        rules.of_coarse_voxels,  # type: ignore[arg-type]
-    )
+        tell(1 + len(halves) + len(sides), steps)
+    dz, dy, dx = spacing
+    wide = structure_of(coarse(volume), materials.thresholds, (2 * dz, 2 * dy, 2 * dx), rules.of_coarse_voxels).numbers
     tell(steps, steps)
-    moved = [float(np.abs((each.thresholds - materials.thresholds) / gaps).max()) for each in others]
     errors = float((np.hypot(materials.errors[1:], materials.errors[:-1]) / gaps).max())
-    off = math.hypot(PARTIAL, errors, STILL_MOVES * float(np.mean(moved or [0.0])))
+    off = math.hypot(PARTIAL, errors, STILL_MOVES * float(np.mean(moved)))
     unsure = probabilities(volume, materials.thresholds, float(materials.spread.max())).max(axis=0) < SURE
     undecided = float(unsure.mean())
-    made = {
-        name: _interval(name, value, [half.numbers[name] for half in halves], (sides[0][name], sides[1][name]),
-                        rough.numbers[name], off)
-        for name, value in whole.numbers.items()
-    }  # fmt: skip
     if undecided > UNDECIDED:
         why = f"{undecided:.0%} of the voxels could be of either material: more views or photons are needed"
-        made = {name: Interval(each.value, why_not=why) for name, each in made.items()}
-    return Found(whole, materials, made, undecided, unsure, halves, off)
+    made = {
+        name: Interval(value, why_not=why)
+        if why
+        else _interval(name, value, [half.numbers[name] for half in halves], [s[name] for s in sides], wide[name], off)
+        for name, value in whole.numbers.items()
+    }
+    return Found(whole, materials, made, undecided, unsure, tuple(halves), off)
 
 
 def _interval(
-    name: str, value: float, halves: Sequence[float], sides: tuple[float, float], wide: float, off: float
+    name: str, value: float, halves: Sequence[float], sides: Sequence[float], wide: float, off: float
 ) -> Interval:
     kind = name.split("_")[0]
     if not math.isfinite(value):

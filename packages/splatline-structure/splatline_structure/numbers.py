@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from recon.base.choices import NECK
 from splatline_structure.materials import F32, F64, Labels, labelled
-from splatline_structure.particles import Numbers, Particles, Spacing, cleaned, measured, parted, surfaces
+from splatline_structure.particles import NECK, Numbers, Particles, Spacing, cleaned, measured, parted, surfaces
 from splatline_structure.transport import connecting, tortuosity
 
 

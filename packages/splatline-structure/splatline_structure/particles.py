@@ -16,6 +16,8 @@ from splatline_structure.materials import F64, Mask
 Numbers = NDArray[np.int32]
 Spacing = tuple[float, float, float]
 
+NECK = 0.8
+"""Two parts are one particle if the neck between them has at least this share of the narrower part's width."""
 _FACES = ndimage.generate_binary_structure(3, 1)  # neighbours of a voxel, with itself
 _GRID = 0.5
 """Error of a distance on the grid, in voxels. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra

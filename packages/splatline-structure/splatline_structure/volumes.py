@@ -9,7 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
+from scipy import ndimage
 
 import recon
 from beamline.api import Selection
@@ -20,7 +22,7 @@ from beamline.projections.prepare import prepare_projections
 from beamline.storage.readers.open import open_scan
 from beamline.storage.volumes.files import opened_volume
 from recon import Grid, Volume
-from recon.post import inscribed_box, sample_circle
+from recon.post import clusters
 from splatline_structure.materials import F32
 
 Box = tuple[slice, slice, slice]
@@ -36,7 +38,7 @@ def read_volume(path: Path, dataset: str | None, voxel_um: float | None, slices:
     Raises:
         DataError: no volume of finite numbers, no size of a voxel, or more voxels than the memory takes.
     """
-    if dataset is None and _is_scan(path):
+    if dataset is None and path.is_file() and h5py.is_hdf5(path) and _is_scan(path):
         raise DataError(f"{path} is a scan: reconstruct it with `beamline recon`. Nothing was written.")
     with opened_volume(path, dataset) as record:
         grid = record.volume.grid
@@ -87,6 +89,51 @@ def box_in(volume: F32, crop: bool) -> Box:
     )
     circle = (float(ny - 1) / 2, float(nx - 1) / 2, field) if rim > _GOES_ON * middle else sample_circle(volume)
     return inscribed_box((nz, ny, nx), circle, _MARGIN)
+
+
+def sample_circle(volume: F32) -> tuple[float, float, float]:
+    """Centre (y, x) and radius of the sample seen along z, in voxels.
+
+    K-means divides the root of the mean over z above its least value into two classes, so that a pin of metal is not
+    one of them; the circle has the extent of the largest connected part.
+
+    Args:
+        volume: [z, y, x], finite.
+
+    Raises:
+        ValueError: the mean is the same everywhere.
+    """
+    mean = volume.mean(axis=0, dtype=np.float64)
+    mean = np.sqrt(mean - mean.min())
+    parts, _ = ndimage.label(ndimage.binary_fill_holes(mean > clusters(mean.ravel(), 2).centres.mean()))
+    largest = np.bincount(parts.ravel())[1:].argmax() + 1
+    rows, cols = np.nonzero(parts == largest)
+    radius = (np.ptp(rows) + np.ptp(cols) + 2) / 4
+    return float(rows.min() + rows.max()) / 2, float(cols.min() + cols.max()) / 2, float(radius)
+
+
+def inscribed_box(shape: tuple[int, int, int], circle: tuple[float, float, float], margin: float = 0.05) -> Box:
+    """All slices of the square inside a circle, of side 2 r cos 45° less a margin, cut to the volume.
+
+    Args:
+        shape: (nz, ny, nx).
+        circle: centre (y, x) and radius in voxels.
+        margin: share of the side taken off at each of its ends, 0 to 0.5.
+
+    Raises:
+        ValueError: for another margin, or a box that is empty.
+    """
+    if not 0 <= margin < 0.5:
+        raise ValueError(f"the margin is a share of the side, 0 to 0.5, got {margin}")
+    *centre, radius = circle
+    half = radius * math.cos(math.pi / 4) * (1 - 2 * margin)
+    y, x = (
+        slice(max(0, math.ceil(c - half)), min(n, math.floor(c + half) + 1))
+        for c, n in zip(centre, shape[1:], strict=True)
+    )
+    if y.start >= y.stop or x.start >= x.stop:
+        raise ValueError(f"the square in a circle of radius {radius:.3g} voxels at {centre} holds no voxel of {shape}")
+    return slice(0, shape[0]), y, x
 
 
 def parts_of(
