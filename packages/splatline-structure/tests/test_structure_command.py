@@ -169,7 +169,10 @@ def test_a_particle_larger_than_the_field_and_no_path_are_words(here: Path) -> N
 def test_the_former_name_says_what_to_use(here: Path) -> None:
     result = beamline("segment", "can.npy")
     assert result.exit_code == 2
-    assert "`beamline segment` is now `beamline structure VOLUME` (pip install splatline-structure)." in result.stderr
+    assert (
+        "no command 'segment' any more: use `beamline structure VOLUME` (pip install splatline-structure)."
+        in result.stderr
+    )
 
 
 def test_a_scan_that_is_not_there_is_a_warning(here: Path, undrawn: None) -> None:
