@@ -15,15 +15,16 @@ from splatline_structure.particles import Spacing
 Told = Callable[[int, int], None]
 Numbers = Mapping[str, float]
 
-STILL_MOVES, BIAS_UNSURE, NOISE = 0.5, 0.5, 1.5
-"""Over what half of the views change a number by: what all views would still change it by, and the half-width of that;
-and of half the difference of both halves, the half-width by noise."""
+BIAS_UNSURE, NOISE = 0.5, 1.5
+"""Half-width by the views: over what half of them change a number by, and over half the difference of both halves."""
 PROBED, PARTIAL = 0.05, 0.012
 """Of the gap of two levels: by how much thresholds are moved to see what they do, and may lie off by partial voxels."""
-OF_VOXELS = {"fraction": 0.3, "size": 0.15, "surface": 0.15, "tortuosity": 0.1}
-"""Half-width over what voxels twice as wide change a number by, by the first word of its name; of others OTHERS. Found,
-as those above, on ten simulated scenes of grains, and looked at on ten others: docs/structure.md."""
-OTHERS = 0.3
+OF_KIND = {"fraction": (0.5, 0.3), "surface": (0.5, 0.2), "size": (0.0, 0.15), "tortuosity": (0.0, 0.1)}
+"""By the first word of a number's name: what all views would still change it by, over what half of them do, and the
+half-width over what voxels twice as wide change it by; of others OTHERS. Found, as the figures above, on ten simulated
+scenes of grains, and looked at once on ten others (docs/structure.md). Sizes and tortuosities moved either way."""
+OTHERS = 0.5, 0.3
+LEVELS_MOVE = 0.5  # thresholds, over what half of the views move them by
 UNDECIDED, SURE = 0.15, 0.8
 """Most voxels that may be undecided, and the probability of one material from which on a voxel is decided."""
 WIDEST, NARROWEST = 0.5, 0.001  # of the value: a wider interval determines no number, and none is narrower to a side
@@ -58,7 +59,7 @@ class Interval:
     @property
     def decides(self) -> str:
         """The cause of the largest half-width."""
-        return max(CAUSES, key=lambda cause: np.nan_to_num(getattr(self, cause)))
+        return max(CAUSES, key=lambda cause: np.nan_to_num(getattr(self, cause), nan=-1.0))
 
     @property
     def words(self) -> str:
@@ -124,7 +125,7 @@ def found_in(
     wide = structure_of(coarse(volume), materials.thresholds, (2 * dz, 2 * dy, 2 * dx), rules.of_coarse_voxels).numbers
     tell(steps, steps)
     errors = float((np.hypot(materials.errors[1:], materials.errors[:-1]) / gaps).max())
-    off = math.hypot(PARTIAL, errors, STILL_MOVES * float(np.mean(moved)))
+    off = math.hypot(PARTIAL, errors, LEVELS_MOVE * float(np.mean(moved)))
     unsure = probabilities(volume, materials.thresholds, float(materials.spread.max())).max(axis=0) < SURE
     undecided = float(unsure.mean())
     if undecided > UNDECIDED:
@@ -147,11 +148,11 @@ def _interval(
         return Interval(value, why_not=nothing if kind != "connected" else "there is none of the material")
     if not all(map(math.isfinite, (*halves, *sides, wide))):
         return Interval(value, why_not="it is there or not by the threshold, half of the views, or the voxels")
-    moves = STILL_MOVES * (value - float(np.mean(halves))) if halves else math.nan
-    noise = NOISE * float(np.ptp(halves)) / 2 if halves else 0.0
-    views = math.hypot(BIAS_UNSURE / STILL_MOVES * moves, noise) if halves else math.nan
+    still, of_voxels = OF_KIND.get(kind, OTHERS)
+    change = value - float(np.mean(halves)) if halves else math.nan
+    moves, views = still * change, math.hypot(BIAS_UNSURE * change, NOISE * float(np.ptp(halves or [0.0])) / 2)
     levels = abs(sides[0] - sides[1]) / 2 * off / PROBED
-    voxels = OF_VOXELS.get(kind, OTHERS) * abs(wide - value)
+    voxels = of_voxels * abs(wide - value)
     half = max(math.hypot(np.nan_to_num(views), levels, voxels), NARROWEST * abs(value))
     middle = value + float(np.nan_to_num(moves))
     low, high = max(middle - half, 0.0), middle + half
