@@ -12,7 +12,7 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
 from beamline.core.files import atomic_file, refuse_existing, write_whole
 from beamline.core.text import csv_text, safe_name
-from splatline_structure.command import measured, structure
+from splatline_structure.command import measured
 
 _FEWEST = 16  # views: 8 of each half
 
@@ -50,10 +50,11 @@ def structure_study(
     from beamline.api import reconstruct
     from beamline.report.html import Picture
     from splatline_structure import pictures, results
+    from splatline_structure.particles import NECK
 
     output = output or Path(f"{safe_name(scan.name.split('.')[0])}_views")
-    values: dict[str, Any] = {each.name: each.default for each in structure.params if each.name}
-    values |= {"materials": materials, "particles": None, "slices": None, "parts": None, "scan": scan}
+    values = {"materials": materials, "particles": None, "slices": None, "parts": None, "scan": scan, "quick": False}
+    values |= {"crop": "square", "radius": 1, "smallest": 27, "neck": NECK, "side": 96, "through": 1}
     with answering(as_json) as answer:
         refuse_existing(output)
         series: list[dict[str, Any]] = []
