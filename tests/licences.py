@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "licences.md"
 
-ADD_ONS = ("areadetector", "cluster", "emission", "models", "neural", "spectral", "tango")
+ADD_ONS = ("areadetector", "cluster", "emission", "models", "neural", "spectral", "structure", "tango")
 FOR_USERS = ("gpu", "epics", "bluesky", "nifti", "txrm", "zarr", *ADD_ONS)
 
 # Where the metadata name no licence, or only a family: read in the licence file of the package.

@@ -183,6 +183,9 @@ def _command(name: str) -> CommandEntry | None:
     return own_commands().get(name) or commands().get(name)
 
 
+_GONE = {"segment": " any more: use `beamline structure VOLUME` (pip install splatline-structure)"}
+
+
 class LazyGroup(click.Group):
     """A group that imports a command's module when the command is used."""
 
@@ -204,7 +207,7 @@ class LazyGroup(click.Group):
         if args and command is None and args[0][:1] not in ("", "-"):
             if args[0] in ADD_ONS:
                 ctx.fail(f"`beamline {args[0]}` {add_on_missing(args[0])}.")
-            ctx.fail(f"There is no command {args[0]!r}{did_you_mean(args[0], commands())}.")
+            ctx.fail(f"There is no command {args[0]!r}{_GONE.get(args[0]) or did_you_mean(args[0], commands())}.")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

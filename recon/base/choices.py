@@ -19,8 +19,6 @@ Start = Literal["fbp", "tv", "published"]
 
 KERNEL = Kernel.COMPACT  # Shape of a fit's Gaussians
 
-NECK = 0.8  # Two parts are one particle if the neck between them has at least this share of the narrower part's width
-
 FEW_PHOTONS = 100
 """Photons in a pixel of the open beam; with fewer, counts are better than logarithms."""
 

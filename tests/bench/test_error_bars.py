@@ -18,15 +18,10 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 import recon
 from recon.base.decisions import Decisions
-from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, RunControl
 from recon.base.view_data import Views
-from recon.base.volume import Grid
 from recon.error_bars import error_bars
-from recon.features.particles import cleaned, measured, parted, volume_deviation
-from recon.post import clusters, enhanced, enhanced_deviation
 from recon.voxels.field_edges import busiest_rows, slab_of
-from recon.voxels.projector import Projector
 from tests.bench.quality_cases import Case, dense_battery, slab
 
 pytestmark = pytest.mark.bench
@@ -95,58 +90,3 @@ def test_voxels_of_the_truth_within_one_deviation(shared_data: Path, name: str, 
         )
         assert all(share > 0.3 for share in shares.values())
         assert not method.fitted or bars < run
-
-
-def balls(seed: int) -> tuple[NDArray[np.float32], list[tuple[NDArray[np.float64], float]]]:
-    """35 balls in a cylinder, at half a voxel; centres (z, y, x) and radii in voxels."""
-    rng, side, rows = np.random.default_rng(seed), 96, 40
-    z, y, x = ((axis + 0.5) / 2 for axis in np.indices((2 * rows, 2 * side, 2 * side), np.float32))
-    volume = np.where(np.hypot(y - side / 2, x - side / 2) < side / 2 - 4, 0.3, 0).astype(np.float32)
-    found: list[tuple[NDArray[np.float64], float]] = []
-    while len(found) < 35:
-        radius, turn = rng.uniform(3, 7), rng.uniform(0, 2 * np.pi)
-        away = (side / 2 - 6 - radius) * np.sqrt(rng.uniform())
-        high = rng.uniform(radius + 2, rows - radius - 2)
-        centre = np.array([high, side / 2 + away * np.cos(turn), side / 2 + away * np.sin(turn)])
-        if all(np.linalg.norm(centre - other) > radius + size + 3 for other, size in found):
-            found.append((centre, radius))
-            volume[(z - centre[0]) ** 2 + (y - centre[1]) ** 2 + (x - centre[2]) ** 2 < radius**2] = 1
-    return volume, found
-
-
-@pytest.mark.parametrize(("seed", "views", "photons"), [(3, 120, 3000), (4, 90, 1000), (5, 150, 10000)])
-def test_volumes_of_balls_within_their_intervals(seed: int, views: int, photons: float) -> None:
-    """Four scans of the same balls with other noise, each segmented."""
-    truth, known = balls(seed)
-    angles = np.linspace(0, np.pi, views, endpoint=False)
-    clean = Projector(Geometry.parallel(angles, (80, 192), pixel_pitch=0.5), Grid(truth.shape, 0.5)).forward(truth)
-    counts = photons * np.exp(-2 / clean.max() * clean).reshape(views, 40, 2, 96, 2).mean(axis=(2, 4))
-    geometry = Geometry.parallel(angles, (40, 96), pixel_pitch=1.0)
-    box, corner = (slice(0, 40), slice(14, 82), slice(14, 82)), np.array([0.5, 14.5, 14.5])
-    methods: dict[str, recon.Method] = {"fbp": recon.Fbp(), "fista-tv": recon.FistaTv(tv_weight=3e-3)}
-    for label, method in methods.items():
-        errors: list[float] = []
-        for repeat in range(4):
-            noisy = np.random.default_rng(10 * seed + repeat).poisson(counts)
-            data = -np.log(np.maximum(noisy, 1) / photons).astype(np.float32)
-            problem = ReconProblem(Views(data, geometry), Grid.matching(geometry))
-            decide = Decisions(0)
-            volume = method.run(problem, RunControl(decide=decide)).volume
-            bars = error_bars(method, problem, volume, decide.made, RunControl())
-            assert bars is not None
-            values = np.ascontiguousarray(volume.data[box])
-            grey = enhanced(values)
-            threshold = clusters(grey, 2).threshold
-            labels = parted(cleaned(grey > threshold, 1, 27))
-            particles = measured(labels)
-            half = volume_deviation(labels, grey, enhanced_deviation(values, bars.deviation[box]), threshold)
-            for place, size, deviation, cut in zip(
-                particles.centroid, particles.volume, half, particles.cut, strict=True
-            ):
-                away = [float(np.linalg.norm(place + corner - centre)) for centre, _ in known]
-                nearest = int(np.argmin(away))
-                if not cut and away[nearest] < 1.5:
-                    errors.append(abs(size - 4 / 3 * np.pi * known[nearest][1] ** 3) / deviation)
-        share = float(np.mean(np.array(errors) <= 1))
-        print(f"\n{views:4d} views {photons:6.0f} photons {label:9s} {len(errors)} balls, {share:.0%} within", end="")
-        assert 0.4 < share < 0.95

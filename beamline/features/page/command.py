@@ -161,7 +161,7 @@ def _serve(folder: Path, port: int, bind: str, browse: bool) -> None:
 @click.option("--open", "browse", is_flag=True, help="Open the page in this machine's browser.")
 @click.option("--napari", "in_napari", is_flag=True, help="Show the volume in napari, if installed.")
 @click.option(
-    "--labels", type=click.Path(path_type=Path), help="With --napari: labels from `segment`, or a TIFF of labels."
+    "--labels", type=click.Path(path_type=Path), help="With --napari: labels from `structure`, or a TIFF of labels."
 )
 def view(
     volume: str,

@@ -63,7 +63,7 @@ def _place(record: ReconRecord) -> dict[str, Any]:
 
 
 def _labels(path: Path, volume: ReconRecord) -> tuple[Any, dict[str, Any]]:
-    """Labels, and their place: that of the volume, or of a part of it where their file states it (`segment`)."""
+    """Labels, and their place: that of the volume, or of a part of it where their file states it (`structure`)."""
     with opened_volume(path) as record:
         values, place = np.asarray(record.volume.data[:]), _place(volume)
     if values.shape != volume.volume.grid.shape and h5py.is_hdf5(path):
@@ -75,6 +75,6 @@ def _labels(path: Path, volume: ReconRecord) -> tuple[Any, dict[str, Any]]:
     if place["scale"] is None or not np.array_equal(values, values.astype(np.int32)):
         raise DataError(
             f"{path} holds {values.dtype} of shape {values.shape}; expected whole numbers of "
-            f"{volume.volume.grid.shape}, as the volume, or the HDF5 file of `beamline segment` of this volume."
+            f"{volume.volume.grid.shape}, as the volume, or an HDF5 file of `beamline structure` of this volume."
         )
     return values.astype(np.int32), place

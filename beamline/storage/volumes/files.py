@@ -66,7 +66,7 @@ class NXtomoproc:
 
 @dataclass(frozen=True)
 class NexusVolume:
-    """HDF5 whose default plot has the axes z, y, x: a reference volume of `simulate`, labels of `segment`; only
+    """HDF5 whose default plot has the axes z, y, x: a reference volume of `simulate`, labels of `structure`; only
     read."""
 
     name: str = "HDF5 (NXdata)"

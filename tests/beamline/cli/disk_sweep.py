@@ -39,7 +39,6 @@ _MODULES = {
     "export": "features.export.command",
     "ingest": "features.files.command features.files.ingest",
     "recon": "cli.recon reconstruct.job reconstruct.pipeline reconstruct.report report.figures",
-    "segment": "features.particles.command",
     "tradeoff": "features.trials.command features.trials.tradeoff",
     "study": "features.trials.command features.trials.tradeoff",
 }

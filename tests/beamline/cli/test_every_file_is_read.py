@@ -43,7 +43,6 @@ FLOATS: dict[str, tuple[str, ...]] = {
     **{f"copy{suffix}": ("export", "fbp.h5", "-o") for suffix in (".h5", ".tif", ".npy", ".nrrd", ".zarr", "")},
 }
 GREYS = {f"grey{suffix}": ("export", "fbp.h5", *WINDOW, "-o") for suffix in (".tif", ".npy", ".nrrd", ".zarr", "")}
-LABELS = {"labels.h5": ("segment", "fbp.h5", "--crop", "none", "-o")}
 FIT = ("recon", "simulated.h5", "-m", "r2", "--steps", "20", "--gaussians", "60", "--no-report", "-o")
 
 
@@ -57,7 +56,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         write_exchange(folder / "exchange.h5", SCAN)
         write_flagged(folder / "recorded.h5", frames_of(SCAN), {}, pixel_size_mm=SCAN.pixel_size_mm)
         simulated = {"simulated.h5": SCANS["simulated.h5"], "fit.h5": FIT}
-        for name, command in {**simulated, **SCANS, **FLOATS, **GREYS, **LABELS}.items():
+        for name, command in {**simulated, **SCANS, **FLOATS, **GREYS}.items():
             if not Path(name).exists():
                 done = beamline(*command, name)
                 assert done.exit_code == 0, (name, done.output)
@@ -110,7 +109,6 @@ VOLUME_READERS = {
     "info": _command("info", "FILE"),
     "validate": _command("validate", "FILE"),
     "export": _command("export", "FILE", "-o", "OUT.nrrd"),
-    "segment": _command("segment", "FILE", "--crop", "none", "--margin", "0", "-o", "OUT.h5"),
     "view": _viewed,
     "truth": _as_truth,
     "scene": _in_a_scene,
@@ -118,19 +116,17 @@ VOLUME_READERS = {
 
 
 @pytest.mark.parametrize("reader", VOLUME_READERS)
-@pytest.mark.parametrize("name", [*FLOATS, *(pytest.param(name, marks=pytest.mark.slow) for name in GREYS), *LABELS])
+@pytest.mark.parametrize("name", [*FLOATS, *(pytest.param(name, marks=pytest.mark.slow) for name in GREYS)])
 def test_volumes(written: Path, tmp_path: Path, name: str, reader: str) -> None:
     if name in GREYS and not name.endswith(".npy") and reader == "export":
         pytest.skip("refused with its reason: grey values of a window are not the volume")
-    if name in LABELS and reader == "truth":
-        pytest.skip("labels are no truth")
     VOLUME_READERS[reader](name, tmp_path)
 
 
 def test_the_voxel_of_every_copy_is_that_of_the_volume(written: Path) -> None:
     with opened_volume(Path("fbp.h5")) as record:
         grid = record.volume.grid
-    for name in (*FLOATS, *GREYS, *LABELS):
+    for name in (*FLOATS, *GREYS):
         if name.startswith("fine") or name.endswith(".npy"):
             continue
         with opened_volume(Path(name)) as record:
@@ -150,10 +146,10 @@ OTHERS: dict[str, tuple[str, ...]] = {
 }
 
 
-@pytest.mark.parametrize("name", [*SCANS, *FLOATS, *GREYS, *LABELS, *OTHERS])
+@pytest.mark.parametrize("name", [*SCANS, *FLOATS, *GREYS, *OTHERS])
 def test_no_output_takes_the_place_of_what_is_there(written: Path, tmp_path: Path, name: str) -> None:
     """Of a file, a folder, or a link, as one to a disk that is not mounted."""
-    command = {**SCANS, **FLOATS, **GREYS, **LABELS, **OTHERS}[name]
+    command = {**SCANS, **FLOATS, **GREYS, **OTHERS}[name]
     there = tmp_path / name
     if name in ("study", "tradeoff", "sweep", "batch"):
         there.mkdir()

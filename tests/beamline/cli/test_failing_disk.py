@@ -34,7 +34,6 @@ FILES = {  # what each command writes
 }
 RESULTS = {
     "recon scan.h5 -m fbp -o out/o.h5": {"o.h5", "o.html"},
-    "segment volume.h5 --crop none -o out/o.h5": {"o.h5", "o.csv", "o.png"},
 }
 FOLDERS = {  # of results, which keep those of the trials that were done: so many
     "tradeoff scan.h5 --methods fbp,sirt -o out/o": 5,

@@ -51,7 +51,6 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "words",
     [
         ("recon",), ("info",), ("validate",), ("monitor",), ("view",), ("runs",), ("export", "-o", "a.tif"),
-        ("segment",),
     ],
     ids=lambda words: words[0],
 )  # fmt: skip

@@ -51,7 +51,7 @@ def test_a_volume_has_its_place_and_unit(tmp_path: Path, layers: dict[str, Any],
 
 
 def test_labels_of_a_part_of_the_volume_stand_where_they_are(tmp_path: Path, layers: dict[str, Any]) -> None:
-    """`segment` crops by default: its labels were refused, as another shape than the volume's."""
+    """`structure` crops by default: its labels were refused, as another shape than the volume's."""
     write_volume(tmp_path / "v.h5", bare_record(tmp_path, RAMP, (0.1, 0.1, 0.1)))
     with h5py.File(tmp_path / "l.h5", "w") as file:
         file["entry/data/labels"] = (RAMP[:, 2:6, 3:7] > 100).astype(np.int32)

@@ -1,0 +1,227 @@
+"""`beamline structure`: numbers of a volume's microstructure, with intervals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamline.cli.options import json_option
+from beamline.cli.terminal import Answer, answering
+from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import atomic_file, refuse_existing
+from beamline.core.text import safe_name
+
+if TYPE_CHECKING:
+    from splatline_structure.intervals import Found
+
+_FILE = click.Path(path_type=Path)
+_SUFFIXES = {"h5": ".h5", "tif": ".tif", "zarr": ".zarr"}
+_FEWEST = 8  # views of each part
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A volume that was read, and what was found in it."""
+
+    path: Path
+    record: Any
+    grid: Any
+    volume: Any
+    found: Found
+
+
+@click.command()
+@click.argument("volumes", metavar="VOLUME...", nargs=-1, required=True, type=_FILE)
+@click.option("--compare", is_flag=True, help="Two volumes, such as charged and discharged: what changed.")
+@click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
+@click.option("--voxel-um", type=click.FloatRange(min=0, min_open=True), help="Edge of a voxel. Default: the file's.")
+@click.option("--materials", type=click.IntRange(2, 6), default=2, show_default=True, help="Number of materials.")
+@click.option(
+    "--particles",
+    type=click.IntRange(1),
+    help="Material of the particles, from 1, the least dense. Default: the densest.",
+)
+@click.option(
+    "--through",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Material whose connected share and tortuosity are taken.",
+)
+@click.option(
+    "--parts", metavar="A B", type=_FILE, nargs=2, help="The volume from every other view, and from the others."
+)
+@click.option(
+    "--scan",
+    type=_FILE,
+    help="Scan of the volume, from whose halves it is made again. Default: the one that the volume names.",
+)
+@click.option("--quick", is_flag=True, help="Leave out what the views do to the numbers.")
+@click.option("--crop", type=click.Choice(["square", "none"]), default="square", show_default=True,
+              help="square: inside the circle of the sample, or of the field, without a can's wall.")  # fmt: skip
+@click.option("--slices", type=click.IntRange(0), nargs=2, metavar="FIRST END", help="Slices to take. Default: all.")
+@click.option(
+    "--radius",
+    type=click.IntRange(0, 20),
+    default=1,
+    show_default=True,
+    help="Radius of opening and closing particles, voxels.",
+)
+@click.option(
+    "--smallest", type=click.IntRange(0), default=27, show_default=True, help="Voxels of the smallest particle."
+)
+@click.option(
+    "--neck",
+    type=click.FloatRange(min=0),
+    default=0.8,
+    show_default=True,
+    help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: always.",
+)
+@click.option(
+    "--side",
+    type=click.IntRange(0),
+    default=96,
+    show_default=True,
+    help="Voxels of the central cube of the tortuosity; 0: none.",
+)
+@click.option(
+    "--labels", type=click.Choice(list(_SUFFIXES)), default="h5", show_default=True, help="Format of the labels."
+)
+@click.option("-o", "--output", type=_FILE, help="New folder. Default: VOLUME's stem + _structure, here.")
+@json_option
+def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_json: bool, **values: Any) -> None:
+    """Measure the microstructure of VOLUME: fractions of materials, particles, surface, contacts, cracks, connected
+    share and tortuosity, each with an interval of 80 %.
+
+    The interval has three causes: the views (the volume is made again from each half of them), the levels of the
+    materials, and the size of a voxel. Where it is wider than half of the value, the number is given as not determined.
+
+    Several volumes are a series in time. The new folder gets report.html, numbers.csv, structure.json, particles.csv
+    and labels.
+    """
+    from beamline.storage.interrupted import volume_file
+
+    if compare and len(volumes) != 2:
+        raise click.UsageError(f"--compare takes two volumes, got {len(volumes)}.")
+    if values["parts"] and (len(volumes) > 1 or values["scan"]):
+        raise click.UsageError("--parts are of one volume, without --scan.")
+    paths = [volume_file(path) for path in volumes]
+    output = output or Path(f"{safe_name(paths[0].name.split('.')[0])}_structure")
+    with answering(as_json) as answer:
+        refuse_existing(output)
+        seen = []
+        for path in paths:
+            try:
+                seen.append(_seen(path, answer, **values))
+            except ValueError as error:
+                raise DataError(f"{path} cannot be measured: {error}. Nothing was written.") from error
+        _write(seen, compare, output, values, answer)
+
+
+def _seen(path: Path, answer: Answer, **values: Any) -> Seen:
+    """One volume, and what was found in it."""
+    from splatline_structure.volumes import read_volume
+
+    record = read_volume(path, values["dataset"], values["voxel_um"], values["slices"])
+    return measured(path, record, answer, **values)
+
+
+def measured(path: Path, record: Any, answer: Answer, **values: Any) -> Seen:
+    """What was found in the volume of a record.
+
+    Raises:
+        ConfigError: a material that is not there. ValueError: no contrast, or parts of other shapes.
+    """
+    import numpy as np
+
+    from splatline_structure.intervals import found_in
+    from splatline_structure.numbers import Rules
+    from splatline_structure.volumes import box_in
+
+    count, particles = values["materials"], values["particles"] or values["materials"]
+    if max(particles, values["through"]) > count:
+        raise ConfigError(
+            f"Material {max(particles, values['through'])} of {count}: they are numbered from 1. Nothing was written."
+        )
+    box = box_in(record.volume.data, values["crop"] == "square")
+    grid, volume = record.grid.part(*box), np.ascontiguousarray(record.volume.data[box])
+    first, end = values["slices"] or (0, None)
+    parts = []
+    for part in _parts(path, record, answer, **values):
+        if part[first:end].shape != record.volume.data.shape:
+            raise ValueError(f"a part of its views has {part.shape} voxels")
+        parts.append(np.ascontiguousarray(part[first:end][box]))
+    rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
+    dz, dy, dx = (1e3 * edge for edge in grid.spacing)
+    found = found_in(volume, parts, count, (dz, dy, dx), rules, answer.counting("structures"))
+    return Seen(path, record, grid, volume, found)
+
+
+def _parts(path: Path, record: Any, answer: Answer, **values: Any) -> list[Any]:
+    """The volume from each half of its views; none where they are not asked for, or not there."""
+    from beamline.storage.volumes.files import opened_volume
+    from splatline_structure.volumes import parts_of
+
+    if values["quick"]:
+        return []
+    if values["parts"]:
+        halves = []
+        for part in values["parts"]:
+            with opened_volume(part) as opened:
+                halves.append(opened.volume.data[: opened.grid.shape[0]])
+        return halves
+    scan = values["scan"] or Path(record.raw_file)
+    if not scan.is_file():
+        answer.warn(
+            f"{path}: its scan is not there ({scan}): the intervals are without what the views do. Give --scan or "
+            "--parts."
+        )
+        return []
+    if int(record.parameters.get("n_views", 2 * _FEWEST)) < 2 * _FEWEST:
+        raise ValueError(f"{record.parameters['n_views']} views are too few to be parted: give --quick")
+    return parts_of(record, scan, 2, answer.warn, answer.counting("halves of the views"))
+
+
+def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any], answer: Answer) -> None:
+    """Write the folder, and say what is in it."""
+    from beamline.report.html import Picture
+    from splatline_structure import pictures, results
+    from splatline_structure.intervals import difference
+
+    first = seen[0]
+    table = first.found.intervals
+    shown = pictures.pictures_of(first.found, first.volume, first.grid)
+    title = f"Structure of {first.path.name}"
+    settings = {"volume": first.path, **{name: value for name, value in values.items() if value is not None}}
+    settings["command"] = " ".join(("beamline structure", *(str(each.path) for each in seen)))
+    states = [results.facts_of(each.found, {**settings, "volume": each.path}) for each in seen]
+    if compare:
+        other = seen[1].found.intervals
+        table = {name: difference(each, other[name]) for name, each in table.items()}
+        title = f"{seen[1].path.name} less {first.path.name}"
+    if len(seen) > 1:
+        names = [name for name, each in first.found.intervals.items() if not each.why_not]
+        curves = {name: [each.found.intervals[name] for each in seen] for name in names}
+        at = [float(each.record.parameters.get("time_s", k)) for k, each in enumerate(seen)]
+        drawn = pictures.curves_of(curves, at, "volume") if curves else None
+        shown = [*([Picture("Numbers of all volumes", "Values with their intervals.", drawn)] if drawn else []), *shown]
+    found = first.found
+    particles = found.structure.particles
+    undecided = (
+        f"{found.undecided:.1%} of the voxels are undecided; {particles.label.size} particles, "
+        f"{int(particles.cut.sum())} cut by a face of the box."
+    )
+    texts = {
+        "report.html": results.page(title, undecided, [], shown, table, settings),
+        "numbers.csv": results.numbers_table(table),
+        "structure.json": results.json_text(states[0] if len(seen) == 1 else {"states": states}),
+        "particles.csv": results.particles_table(particles),
+    }
+    suffix = _SUFFIXES[values["labels"]]
+    labels = {f"materials{suffix}": found.structure.labels + 1, f"particles{suffix}": found.structure.numbered}
+    with atomic_file(output) as partial:
+        results.write_all(partial, texts, labels, first.record, first.grid)
+    answer.done({"output": output, **states[0]}, title, *results.lines_of(table), undecided, f"output  {output}")

@@ -1,0 +1,124 @@
+"""Numbers of a structure: fractions, sizes, surface, contacts, cracks, connected share and tortuosity of a volume."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from splatline_structure.materials import F32, F64, Labels, labelled
+from splatline_structure.particles import NECK, Numbers, Particles, Spacing, cleaned, measured, parted, surfaces
+from splatline_structure.transport import connecting, tortuosity
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How numbers are taken.
+
+    Attributes:
+        particles: number of the material, from 1, the least dense, whose particles are measured.
+        through: of the material whose connected share and tortuosity are.
+        radius: voxels of the ball that opens and closes particles: cracks up to twice as wide are within them.
+        smallest: voxels of the smallest particle.
+        neck: parts that touch are one particle where the neck is this share of the narrower part, or wider.
+        side: voxels of the central cube in which the tortuosity is solved; 0: it is not.
+    """
+
+    particles: int
+    through: int
+    radius: int = 1
+    smallest: int = 27
+    neck: float = NECK
+    side: int = 96
+
+    @property
+    def of_coarse_voxels(self) -> Rules:
+        """The same rules for voxels twice as wide."""
+        return replace(self, smallest=max(self.smallest // 8, 1), side=self.side // 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """What a volume holds.
+
+    Attributes:
+        labels: number of each voxel's material [z, y, x], from 0.
+        numbered: number of each voxel's particle, 0: none.
+        particles: of these, µm.
+        numbers: by name; NaN: there is nothing to take it of, infinity: nothing connects two faces.
+        along_z: share of the particles' material in each slice.
+        radial: the same in rings around the middle, and their radii in µm.
+    """
+
+    labels: Labels
+    numbered: Numbers
+    particles: Particles
+    numbers: dict[str, float]
+    along_z: F64
+    radial: tuple[F64, F64]
+
+
+def unit_of(name: str) -> str:
+    """The unit of a number; empty for shares, counts and factors."""
+    return "1/µm" if name == "surface" else "µm" if name.startswith("size") else ""
+
+
+def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -> Structure:
+    """Labels, particles and numbers of a volume.
+
+    Args:
+        volume: [z, y, x], finite.
+        thresholds: between the levels of neighbouring materials, rising.
+        spacing: edges of a voxel (z, y, x), µm.
+    """
+    labels = labelled(volume, thresholds)
+    mask = labels == rules.particles - 1
+    numbered = parted(cleaned(mask, rules.radius, rules.smallest), rules.neck)
+    particles = measured(numbered, spacing)
+    whole, inside = ~particles.cut, numbered > 0
+    shares = np.bincount(labels.ravel(), minlength=len(thresholds) + 1) / labels.size
+    numbers = {f"fraction_{k}": float(share) for k, share in enumerate(shares, 1)}
+    numbers["surface"] = float(surfaces(mask.astype(np.uint8), spacing, goes_on=True)[-1]) / (
+        mask.size * math.prod(spacing)
+    )
+    numbers |= {f"size_{share}": particles.quantile(share / 100) for share in (10, 50, 90)}
+    numbers["sphericity"] = _median(particles.sphericity[whole])
+    numbers["contacts"] = _mean(np.array([len(each) for each in particles.neighbours])[whole])
+    numbers["cracks"] = _mean(~mask[inside])
+    through = labels == rules.through - 1
+    for axis, name in enumerate("zyx"):
+        share = np.count_nonzero(connecting(through, axis)) / max(np.count_nonzero(through), 1)
+        numbers[f"connected_{name}"] = share if through.any() else math.nan
+        if rules.side:
+            numbers[f"tortuosity_{name}"] = tortuosity(central(through, rules.side), axis)
+    return Structure(labels, numbered, particles, numbers, mask.mean(axis=(1, 2)), _radial(mask, spacing))
+
+
+def central(mask: np.ndarray, side: int) -> np.ndarray:
+    """The cube of `side` voxels in the middle, cut to the volume."""
+    return mask[tuple(slice(max((n - side) // 2, 0), max((n - side) // 2, 0) + min(side, n)) for n in mask.shape)]
+
+
+def coarse(volume: F32) -> F32:
+    """Voxels twice as wide: means of eight; a last odd one is left out."""
+    nz, ny, nx = (n // 2 for n in volume.shape)
+    eight = volume[: 2 * nz, : 2 * ny, : 2 * nx].reshape(nz, 2, ny, 2, nx, 2)
+    return np.asarray(eight.mean(axis=(1, 3, 5), dtype=np.float32))
+
+
+def _radial(mask: np.ndarray, spacing: Spacing) -> tuple[F64, F64]:
+    _, ny, nx = mask.shape
+    y, x = ((np.arange(n) - (n - 1) / 2) * edge for n, edge in zip((ny, nx), spacing[1:], strict=True))
+    ring = (np.hypot(y[:, None], x) / (2 * spacing[2])).astype(int)  # two voxels wide
+    share = ndimage.mean(mask.mean(axis=0), ring, np.arange(ring.max() + 1))
+    return share, (np.arange(ring.max() + 1) + 0.5) * 2 * spacing[2]
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if values.size else math.nan
+
+
+def _median(values: F64) -> float:
+    return float(np.median(values)) if values.size else math.nan

@@ -1,0 +1,173 @@
+"""Particles: parts a mask at narrow necks, and measures the size, shape, place and contacts of each part."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.morphology import ball, local_maxima, reconstruction
+from skimage.segmentation import watershed
+
+from splatline_structure.materials import F64, Mask
+
+Numbers = NDArray[np.int32]
+Spacing = tuple[float, float, float]
+
+NECK = 0.8
+"""Two parts are one particle if the neck between them has at least this share of the narrower part's width."""
+_FACES = ndimage.generate_binary_structure(3, 1)  # neighbours of a voxel, with itself
+_GRID = 0.5
+"""Error of a distance on the grid, in voxels. Without it 41 of 360 turned ellipsoids, plates, bars, octahedra
+are split in error, with it 1. With it 38 of 40 pairs of touching balls are separated, without it 40."""
+_DIRECTIONS = np.array([
+    (z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if (z, y, x) > (0, 0, 0)
+])  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """Particles of a labelled volume, one entry for each.
+
+    Attributes:
+        label: int32, in the labelled volume.
+        volume: in the unit of length cubed.
+        surface: in the unit of length squared.
+        centroid: [particle, 3], (z, y, x).
+        cut: it touches a face of the volume, so that its true size may be larger.
+        neighbours: numbers of the particles that it touches.
+    """
+
+    label: Numbers
+    volume: F64
+    surface: F64
+    centroid: F64
+    cut: Mask
+    neighbours: tuple[tuple[int, ...], ...]
+
+    @property
+    def diameter(self) -> F64:
+        """Diameter of the ball of the same volume, (6 V / π)^(1/3)."""
+        return np.cbrt(6 * self.volume / np.pi)
+
+    @property
+    def sphericity(self) -> F64:
+        """Surface of the ball of the same volume over the particle's (Wadell 1935); 1 for a ball."""
+        return np.pi * self.diameter**2 / np.maximum(self.surface, 1e-12)
+
+    def quantile(self, share: float) -> float:
+        """Diameter below which `share` of the volume of whole particles lies; NaN without whole particles."""
+        order = np.argsort(self.diameter[~self.cut])
+        volume = self.volume[~self.cut][order]
+        if not order.size:
+            return math.nan
+        middles = (np.cumsum(volume) - volume / 2) / volume.sum()
+        return float(np.interp(share, middles, self.diameter[~self.cut][order]))
+
+
+def cleaned(mask: Mask, radius: int = 1, smallest: int = 27) -> Mask:
+    """The mask opened and closed, with holes filled, and parts of fewer than `smallest` voxels removed.
+
+    The volume is continued beyond its faces, so that a particle there loses nothing.
+
+    Args:
+        radius: of opening and closing by a ball, voxels; 0: neither.
+    """
+    out = mask
+    if radius:
+        out = np.pad(out, 2 * radius, mode="edge")
+        out = ndimage.binary_closing(ndimage.binary_opening(out, ball(radius)), ball(radius))
+        out = out[(slice(2 * radius, -2 * radius),) * 3]
+    parts, n = ndimage.label(ndimage.binary_fill_holes(out))
+    kept = np.bincount(parts.ravel(), minlength=n + 1) >= smallest
+    kept[0] = False
+    return np.asarray(kept[parts])
+
+
+def parted(mask: Mask, neck: float) -> Numbers:
+    """Labels [z, y, x] of the particles, 0 elsewhere: connected parts, separated at narrow necks.
+
+    Watershed of the distance to the outside from its maxima (Beucher & Lantuéjoul 1979). Two maxima are one particle if
+    the distance on the neck between them is at least `neck` times the smaller one: a maximum counts if its dynamics in
+    log(distance) are larger than -log(neck) (Grimaud 1992).
+
+    Args:
+        neck: 0: connected parts as they are; 1 or more: every maximum is a particle.
+    """
+    connected, _ = ndimage.label(mask)
+    if neck <= 0:
+        return connected.astype(np.int32)
+    labels, last = np.zeros(mask.shape, np.int32), 0
+    for number, box in enumerate(ndimage.find_objects(connected), 1):
+        inside = np.pad(connected[box] == number, 1)
+        distance = ndimage.distance_transform_edt(inside).astype(np.float32)
+        tops = distance
+        if neck < 1:  # with this offset, heights differ by log(neck) where distances are `neck` times, less _GRID
+            height = np.log(distance + np.float32(_GRID / (1 - neck)))
+            tops = reconstruction(height + np.float32(math.log(neck)), height, footprint=_FACES)
+        maxima, _ = ndimage.label(local_maxima(tops, connectivity=1) & inside)
+        basins = watershed(-ndimage.gaussian_filter(distance, 0.7), maxima, 3, mask=inside)[1:-1, 1:-1, 1:-1]
+        labels[box] = np.where(basins > 0, basins + last, labels[box])
+        last += int(basins.max())
+    return labels
+
+
+def measured(labels: Numbers, spacing: Spacing = (1, 1, 1), origin: Spacing = (0, 0, 0)) -> Particles:
+    """Sizes, shapes, places and contacts of the particles in a labelled volume; the volume ends nothing: see `cut`.
+
+    Args:
+        labels: int [z, y, x], 0 outside.
+        spacing: edges of a voxel (z, y, x).
+        origin: centre of the first voxel (z, y, x).
+    """
+    counts = np.bincount(labels.ravel())
+    number = np.flatnonzero(counts[1:]) + 1
+    centroid = np.array(ndimage.center_of_mass(labels > 0, labels, number)).reshape(-1, 3) * spacing + origin
+    faces = [np.moveaxis(labels, axis, 0)[[0, -1]].ravel() for axis in range(3)]
+    touching: dict[int, set[int]] = {each: set() for each in number.tolist()}
+    for axis in range(3):
+        line = np.moveaxis(labels, axis, 0)
+        here = (line[1:] != line[:-1]) & (line[1:] > 0) & (line[:-1] > 0)
+        for a, b in np.unique(np.stack((line[1:][here], line[:-1][here]), axis=1), axis=0).tolist():
+            touching[a].add(b)
+            touching[b].add(a)
+    return Particles(
+        number.astype(np.int32), counts[number] * math.prod(spacing), surfaces(labels, spacing)[number], centroid,
+        np.isin(number, np.concatenate(faces)), tuple(tuple(sorted(touching[each])) for each in number.tolist()),
+    )  # fmt: skip
+
+
+def surfaces(labels: NDArray[np.integer], spacing: Spacing = (1, 1, 1), goes_on: bool = False) -> F64:
+    """[label] surface of each label within the volume, by Crofton's formula in the 13 directions of neighbours.
+
+    Lines through the voxels in a direction cross a surface as often as it is large and turned towards them; the mean
+    over all directions is half of the surface (Ohser & Schladitz 2009, 3D Images of Materials Structures, 5.2). Each
+    direction counts for those that lie nearest to it. A ball's surface is within 1 % from a radius of 10 voxels on;
+    faces of cubes, whose normals are those of the voxels, come out 5 % low. Faces of the volume are no surface.
+
+    Args:
+        goes_on: the structure goes on beyond the volume: crossings per pair of voxels, times all voxels. Lines end at
+            the faces, so that a direction sees fewer pairs than there are voxels.
+    """
+    steps = _DIRECTIONS * np.asarray(spacing)
+    lengths = np.linalg.norm(steps, axis=1)
+    turn = np.arange(20_000) + 0.5  # points of a sphere, evenly (Vogel 1979)
+    up, around = 1 - 2 * turn / turn.size, math.pi * (1 + math.sqrt(5)) * turn
+    out = np.sqrt(1 - up**2)
+    points = np.stack((up, out * np.sin(around), out * np.cos(around)), axis=1)
+    nearest = np.abs(points @ (steps / lengths[:, None]).T).argmax(axis=1)
+    weights = np.bincount(nearest, minlength=len(steps)) / turn.size
+    total = np.zeros(int(labels.max()) + 1)
+    for step, length, weight in zip(_DIRECTIONS, lengths, weights, strict=True):
+        one, other = (
+            labels[
+                tuple(slice(max(sign * d, 0), n + min(sign * d, 0)) for d, n in zip(step, labels.shape, strict=True))
+            ]
+            for sign in (1, -1)
+        )
+        differs = one != other
+        crossings = np.bincount(one[differs], minlength=total.size) + np.bincount(other[differs], minlength=total.size)
+        total += 2 * weight * math.prod(spacing) / length * crossings * (labels.size / differs.size if goes_on else 1)
+    return total

@@ -1,0 +1,111 @@
+"""Pictures of a structure: a slice with its labels, curves with bands, and bars of the three causes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from beamline.report.figures import WIDTH, draw_slice, finish, new_figure, planes, png
+from beamline.report.html import Picture
+from recon import Grid
+from splatline_structure.intervals import CAUSES, Found, Interval
+from splatline_structure.materials import F32
+from splatline_structure.numbers import Structure
+
+_STEPS = 60  # of a curve of sizes
+
+
+def pictures_of(found: Found, volume: F32, grid: Grid) -> list[Picture]:
+    """All pictures of a page."""
+    structures = [found.structure, *found.parts]
+    drawn = {
+        "Materials": ("The middle slice, its labels (undecided: red), and particles.", slices(found, volume, grid)),
+        "Sizes": ("Share of the volume of whole particles below a diameter.", sizes(structures)),
+        "Profiles": (
+            "Share of the particles' material, with a band by halves of the views.",
+            profiles(structures, grid),
+        ),
+        "What decides": ("Half-width of each number's interval, by cause.", causes(found.intervals)),
+    }
+    return [Picture(title, caption, image) for title, (caption, image) in drawn.items()]
+
+
+def slices(found: Found, volume: F32, grid: Grid) -> bytes:
+    """The middle slice, beside its labels and its particles."""
+    figure = new_figure((WIDTH, WIDTH / 3 * grid.shape[1] / grid.shape[2] + 0.9))
+    at, levels = grid.shape[0] // 2, found.materials.levels
+    plane, window = planes(grid, "mm")[0], (float(levels[0]), float(levels[-1]))
+    left, middle, right = np.ravel(figure.subplots(1, 3, sharex=True, sharey=True))
+    shown = draw_slice(left, volume[at], plane, "volume", window, size=7)
+    labels = found.structure.labels[at].astype(np.float32)
+    draw_slice(middle, labels, plane, "materials", (0.0, max(float(len(levels) - 1), 1.0)), size=7)
+    unsure = np.zeros((*labels.shape, 4))
+    unsure[found.unsure[at]] = (1, 0.1, 0.1, 0.9)
+    middle.imshow(unsure, extent=shown.get_extent(), interpolation="nearest")
+    numbers = found.structure.numbered[at]
+    draw_slice(
+        right, np.where(numbers > 0, numbers * 7 % 20 + 1, 0), plane, "particles", (0.0, 20.0), "nipy_spectral", 7
+    )
+    for axes in (middle, right):
+        axes.label_outer()
+    return png(figure)
+
+
+def sizes(structures: Sequence[Structure]) -> bytes:
+    """Cumulative curves of volume over diameter, of whole particles."""
+    figure = new_figure((WIDTH, 3.2))
+    axes = figure.subplots()
+    whole = [each.particles.diameter[~each.particles.cut] for each in structures]
+    largest = max((float(each.max()) for each in whole if each.size), default=1.0)
+    at = np.linspace(0, largest, _STEPS)
+    curves = [np.array([(d[d <= x] ** 3).sum() for x in at]) / max(float((d**3).sum()), 1e-30) for d in whole]
+    _banded(axes, at, curves)
+    finish(axes, "equivalent diameter (µm)", "share of the volume", f"{whole[0].size} whole particles", grid=True)
+    return png(figure)
+
+
+def profiles(structures: Sequence[Structure], grid: Grid) -> bytes:
+    """The share of the particles' material along z, and in rings around the middle."""
+    figure = new_figure((WIDTH, 2.8))
+    left, right = np.ravel(figure.subplots(1, 2, sharey=True))
+    _banded(left, grid.coordinates()[0], [each.along_z for each in structures])
+    finish(left, "z (mm)", "share", grid=True)
+    _banded(right, structures[0].radial[1], [each.radial[0] for each in structures])
+    finish(right, "from the middle (µm)", "", grid=True)
+    return png(figure)
+
+
+def _banded(axes: Any, at: NDArray[np.floating], curves: Sequence[NDArray[np.floating]]) -> None:
+    """The first curve, and a band from the lowest to the highest of all."""
+    axes.fill_between(at, np.min(curves, axis=0), np.max(curves, axis=0), alpha=0.3)
+    axes.plot(at, curves[0])
+
+
+def causes(intervals: Mapping[str, Interval]) -> bytes:
+    """Bars of the half-widths by each cause, in per cent of the value."""
+    shown = {name: each for name, each in intervals.items() if np.isfinite(each.low) and each.value}
+    figure = new_figure((WIDTH, 1.0 + 0.34 * max(len(shown), 1)))
+    axes = figure.subplots()
+    for k, cause in enumerate(CAUSES):
+        widths = [100 * np.nan_to_num(getattr(each, cause)) / abs(each.value) for each in shown.values()]
+        axes.barh(np.arange(len(shown)) + 0.27 * (k - 1), widths, 0.25, label=cause)
+    axes.set_yticks(range(len(shown)), list(shown))
+    axes.invert_yaxis()
+    finish(axes, "half-width (% of the value)", "", size=8)
+    return png(figure)
+
+
+def curves_of(series: Mapping[str, Sequence[Interval]], at: Sequence[float], across: str) -> bytes:
+    """Numbers against time, or views, with their intervals."""
+    figure = new_figure((WIDTH, 2.2 * len(series)))
+    for axes, (name, each) in zip(
+        np.ravel(figure.subplots(len(series), 1, sharex=True, squeeze=False)), series.items(), strict=True
+    ):
+        low, high, value = (np.array([getattr(one, part) for one in each], float) for part in ("low", "high", "value"))
+        axes.fill_between(at, low, high, alpha=0.3)
+        axes.plot(at, np.where(np.isfinite(value), value, np.nan), "o-")
+        finish(axes, across, name, size=8, grid=True)
+    return png(figure)

@@ -1,0 +1,146 @@
+"""Results: numbers as text, JSON and CSV, particles as a table, labels as volumes, and the page."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from beamline.core.files import write_whole
+from beamline.core.text import csv_text
+from beamline.report.html import Picture, render
+from beamline.storage.hdf5 import created
+from beamline.storage.volumes.base import Pixels
+from beamline.storage.volumes.files import write_volume
+from beamline.storage.writers.recon_file import new_plot
+from recon import Grid, Volume
+from splatline_structure.intervals import Found, Interval
+from splatline_structure.numbers import unit_of
+from splatline_structure.particles import Particles
+
+COLUMNS = "number", "unit", "value", "low", "high", "decides", "moves", "views", "levels", "voxels"
+
+
+def cells(name: str, interval: Interval) -> list[str]:
+    """A row of `COLUMNS`; numbers that are not determined are given as such."""
+    figures = [f"{getattr(interval, each):.4g}" for each in ("moves", "views", "levels", "voxels")]
+    if interval.why_not:
+        return [name, unit_of(name), "not determined", "", "", interval.why_not, *figures]
+    ends = [f"{each:.4g}" for each in (interval.value, interval.low, interval.high)]
+    return [name, unit_of(name), *ends, interval.words, *figures]
+
+
+def lines_of(intervals: Mapping[str, Interval]) -> list[str]:
+    """The table for people."""
+    rows = [cells(name, each)[:6] for name, each in intervals.items()]
+    return [
+        f"{name:<14}{value:>15} {unit:<5}" + (f"{low} to {high}".ljust(20) if low else "") + f"  {words}"
+        for name, unit, value, low, high, words in rows
+    ]
+
+
+def numbers_table(intervals: Mapping[str, Interval]) -> str:
+    return csv_text([list(COLUMNS), *(cells(name, each) for name, each in intervals.items())])
+
+
+def particles_table(particles: Particles) -> str:
+    """A row for each particle, the largest first."""
+    head = "label", "volume_um3", "diameter_um", "sphericity", "z_um", "y_um", "x_um", "cut", "contacts", "neighbours"
+    rows: list[Sequence[object]] = [head]
+    for i in np.argsort(-particles.volume, kind="stable").tolist():
+        sizes = particles.volume[i], particles.diameter[i], particles.sphericity[i], *particles.centroid[i]
+        neighbours = particles.neighbours[i]
+        shown = [f"{each:.6g}" for each in sizes]
+        rows.append(
+            [particles.label[i], *shown, int(particles.cut[i]), len(neighbours), " ".join(map(str, neighbours))]
+        )
+    return csv_text(rows)
+
+
+def facts_of(found: Found, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """All of a structure that is no array, for JSON; numbers that are not determined are null."""
+    numbers = {
+        name: {
+            **asdict(each),
+            "value": None if each.why_not else each.value,
+            "unit": unit_of(name),
+            "decides": each.decides,
+        }
+        for name, each in found.intervals.items()
+    }
+    particles = found.structure.particles
+    return {
+        **settings, "levels": found.materials.levels.tolist(), "spread": found.materials.spread.tolist(),
+        "thresholds_off": found.off, "undecided": found.undecided, "parts": len(found.parts),
+        "particles": int(particles.label.size), "cut": int(particles.cut.sum()), "numbers": numbers,
+        "along_z": found.structure.along_z.tolist(), "radial": found.structure.radial[0].tolist(),
+        "radii_um": found.structure.radial[1].tolist(),
+    }  # fmt: skip
+
+
+def json_text(facts: Mapping[str, Any]) -> str:
+    return json.dumps(_plain(facts), indent=1, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    return (
+        None
+        if isinstance(value, float) and not math.isfinite(value)
+        else str(value)
+        if isinstance(value, Path)
+        else value
+    )
+
+
+def write_labels(path: Path, labels: np.ndarray, record: Any, grid: Grid) -> None:
+    """Whole numbers of voxels in the format of the suffix; HDF5 keeps them as whole numbers at their place."""
+    if path.suffix.lower() in (".h5", ".hdf5"):
+        with created(path) as file:
+            data, chunks = new_plot(file, "labels", grid, "mm"), (1, *labels.shape[1:])
+            data.create_dataset("labels", data=labels, chunks=chunks, compression="gzip", compression_opts=1)
+        return
+    most = int(labels.max())
+    bits = 8 if most < 256 else 16
+    pixels = Pixels(bits, (0.0, float(2**bits - 1))) if most < 65536 else Pixels()
+    volume = Volume(labels.astype(np.float32), grid)
+    write_volume(path, replace(record, volume=volume, title="labels", parameters={}, metrics={}, model={}), pixels)
+
+
+def page(
+    title: str,
+    summary: str,
+    sentences: Sequence[str],
+    pictures: Sequence[Picture],
+    table: Mapping[str, Interval],
+    settings: Mapping[str, Any],
+) -> str:
+    """The report page."""
+    rows = [
+        {"label": name, "cells": cells(name, each)[1:], "marked": False, "reason": ""} for name, each in table.items()
+    ]
+    return render(
+        "trials.html", title=title, summary=summary, sentences=sentences, pictures=pictures, bold=False,
+        heading="Numbers", columns=COLUMNS[1:], rows=rows, scan={name: str(each) for name, each in settings.items()},
+        command=str(settings.get("command", "")),
+    )  # fmt: skip
+
+
+def write_all(
+    folder: Path, texts: Mapping[str, str], labels: Mapping[str, np.ndarray], record: Any, grid: Grid
+) -> None:
+    """Write the files of a new folder, which is there only at the end."""
+    folder.mkdir()
+    for name, text in texts.items():
+        write_whole(folder / name, text)
+    for write in [partial(write_labels, folder / name, each, record, grid) for name, each in labels.items()]:
+        write()

@@ -1,0 +1,83 @@
+"""`beamline structure-study`: intervals of numbers against the number of views of a scan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from beamline.cli.options import as_scan, json_option, parsed
+from beamline.cli.terminal import answering
+from beamline.core.errors import DataError
+from beamline.core.files import atomic_file, refuse_existing, write_whole
+from beamline.core.text import csv_text, safe_name
+from splatline_structure.command import measured
+
+_FEWEST = 16  # views: 8 of each half
+
+
+def numbers_of_views(text: str) -> list[int]:
+    """Parse whole numbers separated by commas. Raises ValueError for other text, or too few views to be parted."""
+    counts = [int(part) for part in text.split(",")]
+    if min(counts) < _FEWEST:
+        raise ValueError(f"{text!r}: expected {_FEWEST} views or more, as both halves are reconstructed")
+    return counts
+
+
+@click.command("structure-study")
+@click.argument("scan", metavar="SCAN|RUN", type=click.Path(path_type=Path), callback=as_scan)
+@click.option("--views", metavar="N,N,...", required=True, callback=parsed(numbers_of_views), help="Numbers of views.")
+@click.option("--number", "names", multiple=True, default=("fraction_2", "size_50", "surface", "tortuosity_z"),
+              show_default=True, help="Number to follow; may be repeated.")  # fmt: skip
+@click.option("-m", "--method", default="fista-tv", show_default=True, help="Of the reconstructions.")
+@click.option("--materials", type=click.IntRange(2, 6), default=2, show_default=True, help="Number of materials.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="New folder. Default: SCAN's stem + _views.")
+@json_option
+def structure_study(
+    scan: Path,
+    views: list[int],
+    names: tuple[str, ...],
+    method: str,
+    materials: int,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Show what fewer views of SCAN cost in numbers of its microstructure: each with its interval, against views.
+
+    Before a beamtime, SCAN is one of `beamline simulate`: so it says how many views a wanted interval takes.
+    """
+    from beamline.api import reconstruct
+    from beamline.report.html import Picture
+    from splatline_structure import pictures, results
+    from splatline_structure.particles import NECK
+
+    output = output or Path(f"{safe_name(scan.name.split('.')[0])}_views")
+    values = {"materials": materials, "particles": None, "slices": None, "parts": None, "scan": scan, "quick": False}
+    values |= {"crop": "square", "radius": 1, "smallest": 27, "neck": NECK, "side": 96, "through": 1}
+    with answering(as_json) as answer:
+        refuse_existing(output)
+        series: list[dict[str, Any]] = []
+        for n in views:
+            record = reconstruct(scan, method, views=f"fixed:{n}", say=None)
+            if record.length_unit != "mm":
+                raise DataError(f"{scan} does not state the size of a pixel. Nothing was written.")
+            try:
+                intervals = measured(scan, record, answer, **values).found.intervals
+            except ValueError as error:
+                raise DataError(f"{n} views of {scan} cannot be measured: {error}. Nothing was written.") from error
+            if unknown := set(names) - set(intervals):
+                raise click.UsageError(f"--number {min(unknown)}: expected one of {', '.join(intervals)}.")
+            series.append(intervals)
+        rows = [
+            [str(n), *results.cells(name, each[name])] for n, each in zip(views, series, strict=True) for name in names
+        ]
+        curves = pictures.curves_of({name: [each[name] for each in series] for name in names}, views, "views")
+        shown = [Picture("Numbers against views", "Values with their intervals; gaps are not determined.", curves)]
+        table = {f"{row[1]}, {row[0]} views": series[views.index(int(row[0]))][row[1]] for row in rows}
+        page = results.page(f"Structure of {scan.name} against views", method, [], shown, table, {"scan": scan})
+        with atomic_file(output) as folder:
+            folder.mkdir()
+            write_whole(folder / "numbers.csv", csv_text([["n_views", *results.COLUMNS], *rows]))
+            write_whole(folder / "report.html", page)
+        answer.done({"output": output, "rows": rows}, *results.lines_of(table), f"output  {output}")

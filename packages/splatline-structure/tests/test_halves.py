@@ -1,0 +1,66 @@
+"""A scan's volume from each half of its views, and numbers against the number of views."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from grain_scenes import Scene
+
+from splatline_structure import pictures
+from tests.beamline.cli.small_scan import beamline, left
+
+SCENE = Scene(5, views=64, size=14, columns=48, rows=16, photons=1e5)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A scan of grains, a column 2 µm wide, in the working folder; nothing is drawn."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(pictures, "pictures_of", lambda *_: [])
+    monkeypatch.setattr(pictures, "curves_of", lambda *_: b"")
+    with h5py.File(tmp_path / "scan.h5", "w") as file:
+        file["exchange/data"] = SCENE.views_of(SCENE.phantom())
+        file["exchange/data"].attrs["units"] = "line_integrals"
+        file["exchange/theta"] = np.degrees(SCENE.geometry.angles)
+        file["exchange/theta"].attrs["units"] = "deg"
+        file.attrs["pixel_size_mm"] = 0.002
+    return tmp_path
+
+
+def test_halves_of_the_volumes_own_scan_are_made(here: Path) -> None:
+    assert beamline("recon", "scan.h5", "-m", "fbp", "--no-report", "-o", "v.h5").exit_code == 0
+    result = beamline("structure", "v.h5", "--side", "24", "--json")
+    assert result.exit_code == 0, result.output
+    done = json.loads(result.stdout.splitlines()[-1])
+    truth = float((SCENE.truth(SCENE.phantom())[:, 13:35, 13:35] > 0.95 * 2 / (0.9 * 48)).mean())
+    fraction = done["numbers"]["fraction_2"]
+    assert done["parts"] == 2 and fraction["views"] > 0
+    assert fraction["value"] == pytest.approx(truth, abs=0.1)
+    assert fraction["low"] < fraction["value"] + fraction["moves"] < fraction["high"]
+    assert {"v.h5", "scan.h5", "v_structure"} == left(here)
+
+
+def test_intervals_against_views_are_wider_for_fewer(here: Path) -> None:
+    words = ("-m", "fbp", "--number", "fraction_2", "--number", "surface")
+    result = beamline("structure-study", "scan.h5", "--views", "16,64", *words)
+    assert result.exit_code == 0, result.output
+    with (here / "scan_views/numbers.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["n_views"], row["number"]) for row in rows] == [
+        (views, name) for views in ("16", "64") for name in ("fraction_2", "surface")
+    ]
+    few, all_ = rows[1], rows[3]
+    assert few["value"] == "not determined" or float(few["views"]) > float(all_["views"])
+    assert (here / "scan_views/report.html").is_file()
+
+
+@pytest.mark.parametrize(("views", "words"), [("8,64", "16 views or more"), ("many", "invalid literal")])
+def test_views_that_cannot_be_parted_are_refused(here: Path, views: str, words: str) -> None:
+    result = beamline("structure-study", "scan.h5", "--views", views)
+    assert result.exit_code == 2 and words in result.stderr
+    assert left(here) == {"scan.h5"}

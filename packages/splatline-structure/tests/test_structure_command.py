@@ -1,0 +1,181 @@
+"""`beamline structure`: files, numbers, the words of intervals, two states, and refusals."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+from can_of_balls import BALLS, can
+from scipy import ndimage
+
+from splatline_structure import command, pictures
+from tests.beamline.cli.small_scan import beamline, left
+
+VOXEL_UM = ("--voxel-um", "10")
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    np.save(tmp_path / "can.npy", can())
+    return tmp_path
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawing takes longer than all the rest."""
+    monkeypatch.setattr(pictures, "pictures_of", lambda *_: [])
+    monkeypatch.setattr(pictures, "curves_of", lambda *_: b"")
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("real_pictures")
+def test_a_volume_gets_a_folder_of_numbers_particles_labels_and_a_page(here: Path) -> None:
+    result = beamline("structure", "can.npy", *VOXEL_UM, "--quick", "--side", "16", "--json")
+    assert result.exit_code == 0, result.output
+    files = {"report.html", "numbers.csv", "structure.json", "particles.csv", "materials.h5", "particles.h5"}
+    assert left(here) == {"can.npy", "can_structure"} and left(here / "can_structure") == files
+    done = json.loads(result.stdout.splitlines()[-1])
+    facts = json.loads((here / "can_structure/structure.json").read_text(encoding="utf-8"))
+    assert done["event"] == "done" and facts["particles"] == done["particles"] == len(BALLS) - 1
+    rows = {row["number"]: row for row in _rows(here / "can_structure/numbers.csv")}
+    size = rows["size_50"]
+    assert float(size["low"]) < float(size["value"]) < float(size["high"]) and size["unit"] == "µm"
+    assert size["decides"] in (
+        "the threshold decides this, not the views",
+        "the size of a voxel decides this, not the views",
+    )
+    assert facts["numbers"]["fraction_2"]["value"] == pytest.approx(float(rows["fraction_2"]["value"]), rel=1e-3)
+    particles = _rows(here / "can_structure/particles.csv")
+    volumes = [float(row["volume_um3"]) for row in particles]
+    assert volumes == sorted(volumes, reverse=True)
+    assert {row["contacts"] for row in particles} == {"0", "1"}
+    with h5py.File(here / "can_structure/particles.h5") as file:
+        labels = file["entry/data/labels"][:]
+        assert np.unique(labels).tolist() == list(range(len(BALLS)))
+        largest = particles[0]
+        at = [int(np.abs(file[f"entry/data/{axis}"][:]).argmin()) for axis in "zyx"]
+        assert (
+            labels.dtype.kind == "i"
+            and len(at) == 3
+            and np.count_nonzero(labels == int(largest["label"])) == round(volumes[0] / 1000)
+        )
+    page = (here / "can_structure/report.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png") == 4 and "Numbers" in page
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_halves_of_the_views_are_part_of_the_interval(here: Path) -> None:
+    rng = np.random.default_rng(1)
+    for name in ("a.npy", "b.npy"):
+        noise = ndimage.gaussian_filter(rng.normal(size=can().shape), 1) * 1.5
+        np.save(here / name, (ndimage.gaussian_filter(can(), 0.7) + noise).astype(np.float32))
+    common = ("structure", "can.npy", *VOXEL_UM, "--side", "0")
+    assert beamline(*common, "--quick", "-o", "quick").exit_code == 0
+    result = beamline(*common, "--parts", "a.npy", "b.npy", "-o", "parts")
+    assert result.exit_code == 0, result.output
+    quick, parts = ({row["number"]: row for row in _rows(here / name / "numbers.csv")} for name in ("quick", "parts"))
+    assert quick["surface"]["views"] == "nan" and float(parts["surface"]["views"]) > 0
+    assert quick["surface"]["value"] == parts["surface"]["value"]
+    width = {
+        name: float(row["surface"]["high"]) - float(row["surface"]["low"]) for name, row in (("q", quick), ("p", parts))
+    }
+    assert width["p"] > width["q"]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_two_states_are_told_apart_or_not(here: Path) -> None:
+    grown = np.maximum(can(), np.roll(can(), 3, axis=0))
+    np.save(here / "grown.npy", grown.astype(np.float32))
+    common = (*VOXEL_UM, "--quick", "--side", "0", "--compare")
+    result = beamline("structure", "can.npy", "grown.npy", *common, "-o", "c")
+    assert result.exit_code == 0, result.output
+    rows = {row["number"]: row for row in _rows(here / "c/numbers.csv")}
+    assert float(rows["fraction_2"]["low"]) > 0
+    same = beamline("structure", "can.npy", "can.npy", *common, "-o", "d")
+    assert same.exit_code == 0
+    assert {row["decides"] for row in _rows(here / "d/numbers.csv") if row["value"] == "not determined"} >= {
+        "no change is told from none"
+    }
+    assert len(json.loads((here / "d/structure.json").read_text(encoding="utf-8"))["states"]) == 2
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_labels_are_a_tiff_of_bytes(here: Path) -> None:
+    assert beamline("structure", "can.npy", *VOXEL_UM, "--quick", "--side", "0", "--labels", "tif").exit_code == 0
+    labels = tifffile.imread(here / "can_structure/particles.tif")
+    assert labels.dtype == np.uint8 and labels.max() == len(BALLS) - 1
+    assert np.unique(tifffile.imread(here / "can_structure/materials.tif")).tolist() == [1, 2]
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_few_photons_determine_nothing(here: Path) -> None:
+    rng = np.random.default_rng(0)
+    blobs = ndimage.gaussian_filter(rng.normal(size=(24, 40, 40)), 3) > 0
+    np.save(here / "noisy.npy", (blobs + rng.normal(0, 0.33, blobs.shape)).astype(np.float32))
+    result = beamline("structure", "noisy.npy", *VOXEL_UM, "--quick", "--side", "0", "--crop", "none")
+    assert result.exit_code == 0, result.output
+    assert "not determined" in result.stdout and "could be of either material" in result.stdout
+
+
+REFUSED = [
+    (("even.npy", *VOXEL_UM), 5, "even.npy cannot be measured"),
+    (("noise.npy", *VOXEL_UM), 5, "no contrast: materials 1 and 2 of 2"),
+    (("can.npy",), 5, "does not state the size of a voxel: give --voxel-um"),
+    (("holes.npy", *VOXEL_UM), 5, "values that are not finite"),
+    (("small.npy", *VOXEL_UM), 5, "expected 8 or more voxels a side"),
+    (("can.npy", *VOXEL_UM, "--slices", "3", "99"), 5, "has slices 0 to 40"),
+    (("can.npy", *VOXEL_UM, "--particles", "3"), 2, "Material 3 of 2"),
+    (("can.npy", *VOXEL_UM, "--compare"), 2, "--compare takes two volumes"),
+    (("can.npy", "can.npy", *VOXEL_UM, "--parts", "can.npy", "can.npy"), 2, "--parts are of one volume"),
+    (("can.npy", *VOXEL_UM, "--parts", "small.npy", "small.npy"), 5, "a part of its views has"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "code", "words"), REFUSED)
+def test_what_has_no_numbers_is_refused_and_nothing_is_written(
+    here: Path, arguments: tuple[str, ...], code: int, words: str
+) -> None:
+    np.save(here / "even.npy", np.ones((10, 12, 12), np.float32))
+    np.save(here / "noise.npy", np.random.default_rng(0).normal(1, 0.1, (20, 30, 30)).astype(np.float32))
+    np.save(here / "holes.npy", np.where(can() > 1, np.nan, can()))
+    np.save(here / "small.npy", np.ones((4, 12, 12), np.float32))
+    before = left(here)
+    result = beamline("structure", *arguments)
+    assert result.exit_code == code and words in result.stderr + str(result.exception), result.output
+    assert left(here) == before
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_particle_larger_than_the_field_and_no_path_are_words(here: Path) -> None:
+    z = np.indices((30, 30, 30))[0]
+    volume = np.where(np.abs(z - 15) < 6, 1.0, 0.0) + np.random.default_rng(0).normal(0, 0.02, (30, 30, 30))
+    np.save(here / "plate.npy", volume.astype(np.float32))
+    result = beamline("structure", "plate.npy", *VOXEL_UM, "--quick", "--crop", "none", "--side", "20")
+    assert result.exit_code == 0, result.output
+    assert "there is no whole particle in the field" in result.stdout and "nothing connects the faces" in result.stdout
+
+
+def test_the_former_name_says_what_to_use(here: Path) -> None:
+    result = beamline("segment", "can.npy")
+    assert result.exit_code == 2
+    assert (
+        "no command 'segment' any more: use `beamline structure VOLUME` (pip install splatline-structure)."
+        in result.stderr
+    )
+
+
+def test_a_scan_that_is_not_there_is_a_warning(here: Path, undrawn: None) -> None:
+    result = beamline("structure", "can.npy", *VOXEL_UM, "--side", "0")
+    assert result.exit_code == 0 and "its scan is not there" in result.stderr
+    assert command.structure.name == "structure"
