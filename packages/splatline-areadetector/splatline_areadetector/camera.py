@@ -18,7 +18,7 @@ from drivers.epics.channel import ProcessVariable, open_channel
 from recon.base.setting import setting
 from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError
 from splatline_areadetector.camera_labels import DRIVERS, DriverLabels
-from splatline_areadetector.stream import Disconnected, FrameStream, Item, Overflow, Queues, Refused
+from splatline_areadetector.stream import Died, Disconnected, FrameStream, Item, Overflow, Queues, Refused
 
 _LOOK_EVERY = 0.02  # s, for a readback
 _SETTLED = 0.2  # s for which no frame comes once a camera is stopped
@@ -363,6 +363,11 @@ class AreaDetectorCamera:
             self._overrun += 1
         elif isinstance(item, Refused):
             self._problem = DeviceError(self.name, f"its frames cannot be taken: {item.why}", state="It is still armed")
+        elif isinstance(item, Died):
+            self._problem = DeviceError(
+                self.name, f"the process that receives its frames has ended ({item.code}), and another one is started",
+                state="Frames taken before are good",
+            )  # fmt: skip
         elif isinstance(item, Disconnected):
             self._problem = DeviceError(
                 self.name, "its IOC has gone", advice="Look whether it runs; it goes on when it is back",

@@ -24,7 +24,7 @@ from splatline_areadetector.guides import EXPOSURE, Guide
 from splatline_areadetector.losses import Counters, Gap, losses_told
 from splatline_areadetector.plan import RidePlan
 from splatline_areadetector.sorter import NewEpoch, Outside, Place, Sorter
-from splatline_areadetector.stream import Disconnected, FrameStream, Overflow, Refused
+from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
 
 SLICE = 0.25  # s: the longest wait for a frame between two looks at the stop request
 SETTLES = 0.2  # s in which the camera's counter comes here, after the frame that it counts
@@ -113,6 +113,8 @@ class RiddenFrames:
                 case Disconnected():
                     self._gone = True
                     self._sink(Warned(f"{self._stream.name}: its server has gone. The ride waits for it."))
+                case Died(code):
+                    self._sink(Warned(f"The process that receives frames has ended ({code}): another one is started."))
                 case Overflow(unique_id):
                     self._overflowed.add(unique_id)
                     if (lost := self._sorter.pass_over(unique_id)) and self._last is not None:
