@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -274,10 +274,26 @@ class RiddenFrames:
                     first, last = (math.degrees(angles[missing[end]]) for end in (0, -1))
                     at = f" (from {first:.4g}° to {last:.4g}°)"
                 words.append(f"{len(missing)} of {block.n} {noun}s are missing: {spans(missing)}{at}.")
+                if at and missing[0] == block.n - len(missing) and not (self._stop.stopping or self.epoch):
+                    words.append(self._first_or_last(missing))
         words += losses_told(self._gaps, self._overflowed, self._by.counters)
         if self._sorter.repeats:
             words.append(f"{count(self._sorter.repeats, 'frame')} came twice and were stored once.")
-        return "".join(f" {sentence}" for sentence in words)
+        return "".join(f" {sentence}" for sentence in words if sentence)
+
+    def _first_or_last(self, missing: Sequence[int]) -> str:
+        """A sentence on projections that are missing at the end, of a scan that ended: "" where their number is known.
+
+        No view shows it: the same turn of all angles gives the same views of a turned sample.
+        """
+        if self._by.counters.camera is not None or self._by.first_id is not None:
+            return ""
+        angles, n = self._plan.angles, len(missing)
+        return (
+            f"As nothing tells the number of the first one, it may be the first {n} that are missing: then all angles "
+            f"are {math.degrees(angles[n] - angles[0]):.4g}° more, by which the volume is turned, and nothing else. "
+            "ride.camera or ride.first_id tells it."
+        )
 
     def _raise_outcome(self) -> None:
         told, planned = self._told(), self._plan.angles.size
