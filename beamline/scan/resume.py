@@ -180,6 +180,11 @@ def _alone(run: Path) -> Iterator[WriterLock]:
 
 
 def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
+    if "\nride:" in (run / CONFIG).read_text(encoding="utf-8", errors="replace"):
+        raise ConfigError(
+            f"{run} is a ride on the scan of another program, which cannot be continued here: `beamline ride` records "
+            f"the next one in a new run. {_UNTOUCHED}"
+        )
     files, left_out = _files(run)
     config = load(run / CONFIG, environment={})
     if given is not None and not config.recon.live:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections import deque
 from collections.abc import Callable
@@ -78,8 +79,11 @@ class RunServer:
         self._decide.put(self._take_answer)
         if control:
             provider.add(prefix + "Decide", self._decide)
+        # p4p would listen at the addresses of the environment, too.
+        others = {name: value for name, value in os.environ.items() if name.startswith("EPICS") and "INTF" not in name}
         try:
-            self._server = Server(providers=[provider], conf={"EPICS_PVAS_INTF_ADDR_LIST": address})
+            conf = {**others, "EPICS_PVAS_INTF_ADDR_LIST": address}
+            self._server = Server(providers=[provider], conf=conf, useenv=False)
         except RuntimeError as error:
             raise DataError(f"{address} cannot be listened at: {error}. Nothing was started.") from error
 

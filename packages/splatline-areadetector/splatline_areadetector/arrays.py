@@ -41,7 +41,7 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class ArrayFrame:
-    """One NTNDArray, copied out of the message; its pixels are decoded when they are asked for.
+    """One NTNDArray; its pixels are decoded when they are asked for.
 
     Attributes:
         unique_id: the driver's number of the frame, usually from 1 at the start of an acquisition.
@@ -80,7 +80,8 @@ class ArrayFrame:
 
 
 def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayFrame | None:
-    """The frame of an NTNDArray that p4p has delivered with `nt=False`; None: it holds no pixels yet.
+    """The frame of an NTNDArray that p4p has delivered with `nt=False`; None: it holds no pixels yet. Its pixels are
+    those of the message.
 
     Raises:
         FrameRefusedError: colour, signed or real pixels, JPEG, or another codec or number of dimensions.
@@ -106,7 +107,7 @@ def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayF
     if not codec and pixels.size != math.prod(window.shape):
         raise FrameRefusedError(f"it has {pixels.size} pixels, and its dimensions say {window.shape}")
     return ArrayFrame(
-        np.array(pixels),  # a view into the message, which the next one overwrites
+        pixels,
         dtype,
         window,
         int(value.uniqueId),

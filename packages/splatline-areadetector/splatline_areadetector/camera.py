@@ -14,13 +14,12 @@ from typing import Literal
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
-from drivers.epics.channel import ProcessVariable, open_channel
 from recon.base.setting import setting
 from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError
 from splatline_areadetector.camera_labels import DRIVERS, DriverLabels
-from splatline_areadetector.stream import Disconnected, FrameStream, Item, Overflow, Queues, Refused
+from splatline_areadetector.camera_records import LOOK_EVERY, Records
+from splatline_areadetector.stream import Died, Disconnected, FrameStream, Item, Overflow, Queues, Refused
 
-_LOOK_EVERY = 0.02  # s, for a readback
 _SETTLED = 0.2  # s for which no frame comes once a camera is stopped
 _LONGEST = 3600.0  # s, exposure
 _LEAST_RING = 2  # frames
@@ -50,60 +49,6 @@ class AreaDetectorSettings:
     timeout: float = setting(5.0, "For an answer of the IOC.", unit="s", gt=0, le=100)
 
 
-class _Records:
-    """The records of an IOC by their names after the prefix, each opened once."""
-
-    def __init__(self, prefix: str, name: str, timeout: float, clock: Clock) -> None:
-        self._prefix, self._name, self._timeout, self._clock = prefix, name, timeout, clock
-        self._opened: dict[str, ProcessVariable] = {}
-
-    def read(self, record: str) -> float | str:
-        (value,) = self._channel(record).read("")
-        return value.label or value.value
-
-    def write(self, record: str, value: float | str) -> None:
-        self._channel(record).write("", value)
-
-    def set(self, record: str, value: float | str, within: float = 0.01) -> float | str:
-        """Write a value, and wait for its readback; a number may differ by this share. The readback."""
-        self.write(record, value)
-        return self.await_value(record, value, within)
-
-    def await_value(self, record: str, value: float | str, within: float = 0.01) -> float | str:
-        """Wait until the readback is this value. Raises DeviceRefused if it does not come to be."""
-        deadline = self._clock.now() + self._timeout
-        while not _is_near(shown := self.read(f"{record}_RBV"), value, within):
-            if self._clock.now() > deadline:
-                raise DeviceRefused(
-                    self._name, f"{record} did not take {value!r}", request=f"{self._prefix}{record} = {value}",
-                    reply=f"{record}_RBV is {shown!r}", state="Other settings may have changed",
-                    advice="Try it in the camera's control screen, and check `driver`",
-                )  # fmt: skip
-            self._clock.sleep(_LOOK_EVERY)
-        return shown
-
-    def close(self) -> None:
-        for channel in self._opened.values():
-            channel.close()
-
-    def _channel(self, record: str) -> ProcessVariable:
-        if record not in self._opened:
-            self._opened[record] = open_channel(f"{self._prefix}{record}", self._name, self._timeout)
-        return self._opened[record]
-
-
-def _is_near(shown: float | str, value: float | str, within: float) -> bool:
-    if isinstance(shown, str) or isinstance(value, str):
-        return shown == value or (isinstance(shown, str) and shown in _SWITCHED.get(value, ()))
-    return abs(shown - value) <= within * abs(value) + 1e-9
-
-
-_SWITCHED: dict[float | str, tuple[str, ...]] = {
-    0: ("No", "Disable", "Off", "Done"), 1: ("Yes", "Enable", "On", "Acquire", "Acquiring"),
-}  # fmt: skip
-"""Labels of switches, which are written as 0 or 1."""
-
-
 class AreaDetectorCamera:
     """Implements drivers.base.protocols.Camera. See `AreaDetectorSettings`.
 
@@ -121,7 +66,7 @@ class AreaDetectorCamera:
     def __init__(self, settings: AreaDetectorSettings, clock: Clock) -> None:
         self.name, self._own, self._clock = "camera", settings, clock
         self._labels: DriverLabels = DRIVERS[settings.driver]
-        self._records = _Records(settings.prefix, self.name, settings.timeout, clock)
+        self._records = Records(settings.prefix, self.name, settings.timeout, clock)
         self._changed = threading.Condition()
         self._ring = deque[CameraFrame]()
         self._ring_size, self._lost, self._overrun = _LEAST_RING, 0, 0
@@ -340,7 +285,7 @@ class AreaDetectorCamera:
         """Let frames of an earlier run pass by, which the network may still hold."""
         silent, seen = self._clock.now(), self._stream_items
         while self._clock.now() - silent < _SETTLED:
-            self._clock.sleep(_LOOK_EVERY)
+            self._clock.sleep(LOOK_EVERY)
             if self._stream_items != seen:
                 silent, seen = self._clock.now(), self._stream_items
 
@@ -363,6 +308,11 @@ class AreaDetectorCamera:
             self._overrun += 1
         elif isinstance(item, Refused):
             self._problem = DeviceError(self.name, f"its frames cannot be taken: {item.why}", state="It is still armed")
+        elif isinstance(item, Died):
+            self._problem = DeviceError(
+                self.name, f"the process that receives its frames has ended ({item.code}), and another one is started",
+                state="Frames taken before are good",
+            )  # fmt: skip
         elif isinstance(item, Disconnected):
             self._problem = DeviceError(
                 self.name, "its IOC has gone", advice="Look whether it runs; it goes on when it is back",

@@ -1,7 +1,7 @@
 """What drivers of areaDetector are told for each source of triggers: records of `cam1:` and labels, in this order.
 
 Labels, never indices: a driver's choices change with its camera. Sources: the templates of ADSpinnaker and ADGenICam,
-ADSimDetector, ADPcoWin, ADAndor3, ADHamamatsuDCAM and ADEiger, and what tomoscan (APS) writes.
+ADSimDetector, ADPcoWin, ADAndor3 and ADHamamatsuDCAM, eigerBase.template of ADEiger, and what tomoscan (APS) writes.
 """
 
 from __future__ import annotations

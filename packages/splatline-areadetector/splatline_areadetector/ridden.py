@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +24,7 @@ from splatline_areadetector.guides import EXPOSURE, Guide
 from splatline_areadetector.losses import Counters, Gap, losses_told
 from splatline_areadetector.plan import RidePlan
 from splatline_areadetector.sorter import NewEpoch, Outside, Place, Sorter
-from splatline_areadetector.stream import Disconnected, FrameStream, Overflow, Refused
+from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
 
 SLICE = 0.25  # s: the longest wait for a frame between two looks at the stop request
 SETTLES = 0.2  # s in which the camera's counter comes here, after the frame that it counts
@@ -113,6 +113,8 @@ class RiddenFrames:
                 case Disconnected():
                     self._gone = True
                     self._sink(Warned(f"{self._stream.name}: its server has gone. The ride waits for it."))
+                case Died(code):
+                    self._sink(Warned(f"The process that receives frames has ended ({code}): another one is started."))
                 case Overflow(unique_id):
                     self._overflowed.add(unique_id)
                     if (lost := self._sorter.pass_over(unique_id)) and self._last is not None:
@@ -272,10 +274,26 @@ class RiddenFrames:
                     first, last = (math.degrees(angles[missing[end]]) for end in (0, -1))
                     at = f" (from {first:.4g}° to {last:.4g}°)"
                 words.append(f"{len(missing)} of {block.n} {noun}s are missing: {spans(missing)}{at}.")
+                if at and missing[0] == block.n - len(missing) and not (self._stop.stopping or self.epoch):
+                    words.append(self._first_or_last(missing))
         words += losses_told(self._gaps, self._overflowed, self._by.counters)
         if self._sorter.repeats:
             words.append(f"{count(self._sorter.repeats, 'frame')} came twice and were stored once.")
-        return "".join(f" {sentence}" for sentence in words)
+        return "".join(f" {sentence}" for sentence in words if sentence)
+
+    def _first_or_last(self, missing: Sequence[int]) -> str:
+        """A sentence on projections that are missing at the end, of a scan that ended: "" where their number is known.
+
+        No view shows it: the same turn of all angles gives the same views of a turned sample.
+        """
+        if self._by.counters.camera is not None or self._by.first_id is not None:
+            return ""
+        angles, n = self._plan.angles, len(missing)
+        return (
+            f"As nothing tells the number of the first one, it may be the first {n} that are missing: then all angles "
+            f"are {math.degrees(angles[n] - angles[0]):.4g}° more, by which the volume is turned, and nothing else. "
+            "ride.camera or ride.first_id tells it."
+        )
 
     def _raise_outcome(self) -> None:
         told, planned = self._told(), self._plan.angles.size

@@ -28,7 +28,7 @@ from drivers.base.errors import DeviceRefused
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import Devices
 from splatline_areadetector.arrays import ArrayFrame
-from splatline_areadetector.config import RideConfig
+from splatline_areadetector.config import RideConfig, TomoscanAngles
 from splatline_areadetector.guides import EXPOSURE, Guide, guide_of
 from splatline_areadetector.losses import Counters
 from splatline_areadetector.plan import PlannedBlock, RidePlan, ready_of
@@ -142,7 +142,7 @@ def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
     clock = SystemClock()
     since, told = clock.now(), False
     shown = stream.first and f" ({stream.first.window.shape[0]} x {stream.first.window.shape[1]} {stream.first.dtype})"
-    ride.say(f"Waiting for the first frame of a scan from {stream.name}{shown or ''}.")
+    ride.say(f"Waiting for the first frame of a scan from {stream.name}{shown or ''}.{_untold_exposure(ride)}")
     while not ride.stop.stopping:
         item = stream.next(SLICE)
         if isinstance(item, Refused):
@@ -169,6 +169,16 @@ def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
                 )
             ride.say(f"No frame for {settings.silence_s:g} s, the server answers: {silence_told(ride.counters)}.")
     raise ScanAborted(f"Interrupted before the first frame: {ride.stop.reason}. Nothing was recorded.")
+
+
+def _untold_exposure(ride: Ride) -> str:
+    """A sentence after a blank where the scan's first frame will have to tell its exposure; "" where something else
+    does."""
+    settings, first = ride.config.ride, ride.stream.first
+    told = first is None or EXPOSURE in first.attributes or isinstance(settings.angles, TomoscanAngles)
+    if told or settings.exposure_s or ride.counters.camera is not None:
+        return ""
+    return f" Nothing tells the exposure yet: its frames must have the attribute {EXPOSURE}, else set ride.exposure_s."
 
 
 def _with_exposure(plan: RidePlan, ride: Ride, first: ArrayFrame) -> RidePlan:

@@ -1,28 +1,39 @@
 """FrameStream: a subscription to an areaDetector's image over PVAccess, emptied at once into a ring of ours.
 
 The server keeps a queue for each client and overwrites its newest entry when it is full, without a word. So it is asked
-for about a second, and whatever it delivers is copied at once. `pipeline=true` would let the server wait for us, but
-today's servers of NDPluginPva then repeat frames. What is lost shows as a gap in the frames' numbers.
+for about a second, and a process of its own (`receiver`) copies at once whatever it delivers. `pipeline=true` would
+let the server wait for us, but today's servers of NDPluginPva then repeat frames. What is lost shows as a gap in the
+frames' numbers.
 """
 
 from __future__ import annotations
 
+import json
 import math
+import mmap
+import os
+import subprocess
+import sys
 import threading
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 from beamline.core.errors import BeamlineError, ConfigError
+from beamline.core.text import size
 from drivers.base.errors import DeviceTimeout
-from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError, array_frame
+from splatline_areadetector.arrays import ArrayFrame, array_frame
+from splatline_areadetector.receiver import frame_of
 
 SCHEME = "pva://"
 _LEAST, _MOST = 4, 1000  # frames of the queue
 _USUAL = 100.0  # frames/s of a camera whose period is not known
-_TICK, _STILL = 0.1, 0.4  # s between two looks at the clock, and beyond it, at which this process stood still
+_STARTS, _AGAIN = 60.0, 0.5  # s for a receiver to start, and before another one is
 ANSWERS_WITHIN = 3.0  # s
 UNREACHABLE = "Check the name, that its IOC runs, and which hosts are asked (EPICS_PVA_ADDR_LIST)"
 
@@ -47,7 +58,14 @@ class Disconnected:
     """The server has gone: it was stopped, or has not answered for EPICS_PVA_CONN_TMO (40 s)."""
 
 
-Item = ArrayFrame | Refused | Overflow | Disconnected
+@dataclass(frozen=True)
+class Died:
+    """The process that receives has died with this exit code; another one is being started."""
+
+    code: int
+
+
+Item = ArrayFrame | Refused | Overflow | Disconnected | Died
 
 
 @dataclass(frozen=True)
@@ -85,7 +103,8 @@ def image_problem(url: str) -> str:
 class FrameStream:
     """The frames of a process variable, in the order in which they came, until `close`.
 
-    The callback of p4p copies each into the ring and never raises: an exception there would end the subscription.
+    The pixels of a frame stay where the receiver put them, in a ring of memory that both processes share; a frame's
+    place is free again when nobody has its pixels any more.
 
     Args:
         url: pva://NAME.
@@ -97,42 +116,42 @@ class FrameStream:
         name: of the process variable.
         first: the frame that the server had when it was asked; None: it had none yet.
         queue: frames that the server was asked to hold.
-        still: intervals of the Unix time during which this process stood still.
+        still: intervals of the Unix time during which no frame could be received.
 
     Raises:
-        ConfigError: the address is no pva://NAME, p4p is not installed, or the variable is no NTNDArray.
+        ConfigError: the address is no pva://NAME, p4p is not installed, the variable is no NTNDArray, or there is too
+            little memory.
         DeviceTimeout: no server answers.
         FrameRefusedError: its frames cannot be stored.
     """
 
     def __init__(
-        self,
-        url: str,
-        queues: Queues | None = None,
-        period: float | None = None,
-        within: float = ANSWERS_WITHIN,
-        now: Callable[[], float] = time.time,
+        self, url: str, queues: Queues | None = None, period: float | None = None, within: float = ANSWERS_WITHIN
     ) -> None:
         if problem := image_problem(url):
             raise ConfigError(f"{problem}. Nothing was started.")
-        self.name, self._now, queues = url.removeprefix(SCHEME), now, queues or Queues()
+        self.name, queues = url.removeprefix(SCHEME), queues or Queues()
         self._context = _context()
         self.still: list[tuple[float, float]] = []
         self._items: deque[Item] = deque()
-        self._held, self._room = 0, int(1e6 * queues.ring_megabytes)
-        self._fresh, self._changed, self._over = True, threading.Condition(), threading.Event()
-        try:
+        self._changed, self._ready, self._over = threading.Condition(), threading.Event(), False
+        with ExitStack() as opened:
+            opened.callback(self._context.close)
             value = self._get("", within)
             _refuse_other(self.name, value)
-            self.first = array_frame(value, now(), is_current=True)
+            self.first = array_frame(value, time.time(), is_current=True)
             self.queue = queues.frames(0 if self.first is None else self.first.n_bytes, period)
-            self._subscription = self._context.monitor(
-                self.name, self._on_update, request=f"record[queueSize={self.queue}]", notify_disconnect=True
-            )
-        except BaseException:
-            self._context.close()
-            raise
-        threading.Thread(target=self._watch_clock, name="stands still", daemon=True).start()
+            self._n_bytes, self._died_at = int(1e6 * queues.ring_megabytes), math.nan
+            self._start()
+            self._reader = threading.Thread(target=self._read, name=f"receives {self.name}", daemon=True)
+            self._reader.start()
+            opened.callback(self._end)
+            if not self._ready.wait(_STARTS) or not math.isnan(self._died_at):
+                raise ConfigError(
+                    f"The process that receives {self.name} did not start within {_STARTS:g} s, or ended. Nothing was "
+                    "recorded."
+                )
+            self._close = opened.pop_all().close
 
     @property
     def waiting(self) -> int:
@@ -144,16 +163,12 @@ class FrameStream:
         with self._changed:
             if not self._items and not self._changed.wait_for(lambda: self._items, timeout):
                 return None
-            item = self._items.popleft()
-            if isinstance(item, ArrayFrame):
-                self._held -= item.n_bytes
-            return item
+            return self._items.popleft()
 
     def put_back(self, item: Item) -> None:
         """Have `next` return this item again, before all others."""
         with self._changed:
             self._items.appendleft(item)
-            self._held += item.n_bytes if isinstance(item, ArrayFrame) else 0
             self._changed.notify()
 
     def answers(self) -> bool:
@@ -165,15 +180,12 @@ class FrameStream:
         return True
 
     def stood_still(self, begin: float, end: float) -> float:
-        """s of this interval of the Unix time in which this process stood still, or of a second after it."""
+        """s of this interval of the Unix time in which no frame could be received, or of a second after it."""
         return sum(max(0.0, min(end + 1.0, b) - max(begin, a)) for a, b in [*self.still])
 
     def close(self) -> None:
-        """End the subscription. A second time does nothing."""
-        if not self._over.is_set():
-            self._over.set()
-            self._subscription.close()
-            self._context.close()
+        """End the subscription; frames that were taken stay. A second time does nothing."""
+        self._close()
 
     def __enter__(self) -> Self:
         return self
@@ -193,42 +205,92 @@ class FrameStream:
         except RemoteError as error:
             raise ConfigError(f"{self.name} refuses to be read: {error}. Nothing was started.") from None
 
-    def _on_update(self, value: Any) -> None:
-        received = self._now()
-        try:
-            if isinstance(value, Exception):
-                if not self._fresh:  # every subscription begins disconnected
-                    self._put(Disconnected())
-                self._fresh = True
+    def _start(self) -> None:
+        """Start a receiver, with new memory. Ctrl-C does not reach it, and it imports what this process does."""
+        self._memory, word, self._let_go = _shared_memory(self._n_bytes)
+        present = 0 if self.first is None else min(self.queue * self.first.n_bytes, self._n_bytes)
+        arguments = (self.name, f"{self.queue}", word, f"{self._n_bytes}", f"{present}")
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "splatline_areadetector.receiver", *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            start_new_session=True,
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
+            | getattr(subprocess, "CREATE_NO_WINDOW", 0),
+        )
+
+    def _end(self) -> None:
+        self._over = True
+        self._process.kill()
+        self._reader.join()
+        self._let_go()
+
+    def _read(self) -> None:
+        """Take what the receiver says, in a thread. Where it dies, another one is started."""
+        while True:
+            process = self._process
+            assert process.stdin is not None and process.stdout is not None
+            with process.stdin, process.stdout as lines:
+                for line in lines:
+                    self._take(*json.loads(line))
+            code, self._died_at = process.wait(), time.time()
+            if self._over or not self._ready.is_set():  # the first one: whoever waits for it says so
+                self._ready.set()
                 return
-            item: Item | None
-            is_current, self._fresh = self._fresh, False
-            try:
-                item = array_frame(value, received, is_current)
-            except FrameRefusedError as error:
-                item = Refused(int(value.uniqueId), str(error))
-            if item is not None:
-                self._put(item)
-        except BaseException as error:  # whatever a message holds, the next one may be sound
-            self._put(Refused(-1, f"it cannot be read ({error!r})"))
+            self._put(Died(code))
+            time.sleep(_AGAIN)
+            self._let_go()
+            self._start()
+
+    def _take(self, what: str, *facts: Any) -> None:
+        """Take a line of the receiver."""
+        match what:
+            case "frame":
+                self._put(frame_of(self._memory, facts[0]))
+            case "refused":
+                self._put(Refused(*facts))
+            case "overflow":
+                self._put(Overflow(*facts))
+            case "gone":
+                self._put(Disconnected())
+            case "still":
+                self.still.append(facts)
+            case "ready":
+                if not math.isnan(self._died_at):
+                    self.still.append((self._died_at, time.time()))
+                self._ready.set()
 
     def _put(self, item: Item) -> None:
         with self._changed:
-            if isinstance(item, ArrayFrame):
-                if self._held + item.n_bytes > self._room:
-                    item = Overflow(item.unique_id)
-                else:
-                    self._held += item.n_bytes
             self._items.append(item)
             self._changed.notify()
 
-    def _watch_clock(self) -> None:
-        before = time.monotonic()
-        while not self._over.wait(_TICK):
-            now = time.monotonic()
-            if (still := now - before) > _TICK + _STILL:
-                self.still.append((self._now() - still, self._now()))
-            before = now
+
+def _shared_memory(n_bytes: int) -> tuple[mmap.mmap, str, Callable[[], None]]:
+    """Memory, given where it is used, the word by which a receiver opens it, and what ends that: the memory itself goes
+    with the last array in it. ConfigError: there is too little."""
+    try:
+        if sys.platform == "win32":
+            word = f"splatline-{uuid.uuid4()}"
+            return mmap.mmap(-1, n_bytes, tagname=word), word, lambda: None
+        handle = os.memfd_create("frames")
+        try:
+            os.ftruncate(handle, n_bytes)
+            memory = mmap.mmap(handle, n_bytes)
+        except BaseException:
+            os.close(handle)
+            raise
+        return memory, f"/proc/{os.getpid()}/fd/{handle}", partial(_closed_once, [handle])
+    except (OSError, ValueError, OverflowError) as error:
+        raise ConfigError(f"There is no memory of {size(n_bytes)} for frames ({error}): lower ring_mb.") from error
+
+
+def _closed_once(handles: list[int]) -> None:
+    while handles:
+        os.close(handles.pop())
 
 
 def _refuse_other(name: str, value: Any) -> None:

@@ -16,6 +16,7 @@ from typing import Any, Self
 
 from beamline.core.errors import ConfigError
 from drivers.base.errors import DeviceTimeout
+from splatline_areadetector.subscribed import Subscribed
 
 Value = float | str
 _ANSWER, _OTHERS = 3.0, 1.5  # s, for variables that are needed, and for others
@@ -161,10 +162,6 @@ def _plain(value: Any) -> Value:
 
 
 def _over_pva(adders: dict[str, Add]) -> Callable[[], None]:
-    from p4p.client.thread import Context
-
-    context = Context("pva", nt=False)
-
     def taking(add: Add) -> Callable[[Any], None]:
         def take(update: Any) -> None:
             if isinstance(update, Exception):
@@ -176,14 +173,7 @@ def _over_pva(adders: dict[str, Add]) -> Callable[[], None]:
 
         return take
 
-    subscriptions = [context.monitor(name, taking(add)) for name, add in adders.items()]
-
-    def close() -> None:
-        for each in subscriptions:
-            each.close()
-        context.close()
-
-    return close
+    return Subscribed({name: taking(add) for name, add in adders.items()}).close
 
 
 _LOOP: list[asyncio.AbstractEventLoop] = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,21 +11,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))  # for the fakes beside the tests
 
 
-def _free_ports(n: int) -> list[int]:
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(n)]
-    try:
-        for each in sockets:
-            each.bind(("127.0.0.1", 0))
-        return [each.getsockname()[1] for each in sockets]
-    finally:
-        for each in sockets:
-            each.close()
-
-
 @pytest.fixture(scope="module")
 def loopback() -> Iterator[dict[str, str]]:
     """The environment of EPICS's clients and servers, which this process has, too, meanwhile."""
-    pva, ca, beacons, server = _free_ports(4)
+    from free_ports import free_ports  # beside this file
+
+    pva, ca, beacons, server = free_ports(4)
     environment = {
         "EPICS_PVA_ADDR_LIST": "127.0.0.1", "EPICS_PVA_AUTO_ADDR_LIST": "NO", "EPICS_PVA_BROADCAST_PORT": f"{pva}",
         "EPICS_PVAS_BROADCAST_PORT": f"{pva}", "EPICS_PVAS_INTF_ADDR_LIST": "127.0.0.1",

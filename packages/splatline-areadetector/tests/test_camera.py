@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from free_ports import free_ports
 
 from beamline.config.load import load
 from beamline.core.errors import ConfigError
@@ -38,12 +40,17 @@ REFUSED = [
 
 
 class FakeIoc:
-    """The fake camera's program, ready."""
+    """The fake camera's program, ready. Its port of Channel Access is its own: of several IOCs at one port of a
+    computer, only one is found by an address without a broadcast."""
 
     def __init__(self, prefix: str, driver: str) -> None:
         command = [sys.executable, str(FAKE), prefix, driver]
         self.prefix, self.driver = prefix, driver
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        (self.port,) = free_ports(1)
+        environment = {**os.environ, "EPICS_CA_SERVER_PORT": f"{self.port}", "EPICS_CAS_SERVER_PORT": f"{self.port}"}
+        self.process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
         assert self.process.stdout is not None
         while (line := self.process.stdout.readline()) != "ready\n":
             assert line, "the fake camera has ended"
@@ -201,7 +208,7 @@ camera.configure(CameraSettings(0.01, TriggerSource.SOFTWARE, (32, 64, 64, 96), 
 camera.arm(2)
 for _ in range(2):
     camera.software_trigger()
-    frame = camera.next_frame(5.0)
+    frame = camera.next_frame(30.0)
     print(frame.framestamp, frame.counts.shape, frame.counts.max())
 print(camera.describe()["model"])
 camera.close()
@@ -210,7 +217,10 @@ camera.close()
 
 def test_its_records_answer_by_channel_access_too(spinnaker: FakeIoc, loopback: dict[str, str]) -> None:
     """In a process of its own: Channel Access reads its environment once."""
-    done = subprocess.run([sys.executable, "-c", BY_CHANNEL_ACCESS], capture_output=True, text=True, timeout=120)
+    environment = {**os.environ, "EPICS_CA_ADDR_LIST": f"127.0.0.1:{spinnaker.port}"}
+    done = subprocess.run(
+        [sys.executable, "-c", BY_CHANNEL_ACCESS], capture_output=True, text=True, timeout=120, env=environment
+    )
     assert done.stdout.splitlines() == ["0 (32, 48) 1", "1 (32, 48) 2", "fake"], done.stderr
 
 

@@ -81,6 +81,26 @@ def test_tomoscan_tells_kinds_and_angles(tmp_path: Path, restarted: bool) -> Non
     assert any("of no scan" in text for text in told.before)
 
 
+@pytest.mark.parametrize("first_id", [None, 100])
+def test_a_first_projection_that_is_lost_shows_at_the_end_and_it_is_said_that_it_may_be_either(
+    tmp_path: Path, first_id: int | None
+) -> None:
+    def scan(stop: StopRequest) -> None:
+        ioc.tomoscan(ScanStatus="Collecting projections")
+        time.sleep(0.1)
+        ioc.send(range(101, 108), 0.02)  # of 8
+        ioc.tomoscan(ScanStatus="Scan complete")
+
+    with FakeIoc() as ioc:
+        ioc.tomoscan(**{**TOMOSCAN, "NumDarkFields": 0.0, "NumFlatFields": 0.0})
+        angles = {"from": "tomoscan", "prefix": "pva://T:TomoScan:"}
+        told = ride_along(config_of(tmp_path, ioc.url, angles, first_id=first_id), tmp_path, scan)
+    (file,) = stored(tmp_path)
+    assert isinstance(told.error, LedgerError) and file.missing == ([7] if first_id is None else [0])
+    undecided = "it may be the first 1 that are missing: then all angles are 0.5° more, by which the volume is turned"
+    assert (undecided in str(told.error)) is (first_id is None)
+
+
 class _ByChannelAccess(FakeIoc):
     """A fake IOC whose tomoscan is another program, which answers Channel Access."""
 

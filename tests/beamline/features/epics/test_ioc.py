@@ -50,6 +50,14 @@ def _put(server: RunServer, client: Any, name: str, value: object = True) -> Non
     answer.result()
 
 
+def test_it_listens_where_it_is_told_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """p4p adds an address of the environment to one that it is given; this one is no machine's."""
+    monkeypatch.setenv("EPICS_PVAS_INTF_ADDR_LIST", "192.0.2.1")
+    with _served(tmp_path) as (server, client):
+        assert server.configuration["EPICS_PVAS_INTF_ADDR_LIST"] == "127.0.0.1"
+        assert client.get("T:ScanStatus") == "idle"
+
+
 def test_without_a_run_it_is_idle_and_beats(tmp_path: Path) -> None:
     with _served(tmp_path) as (server, client):
         assert client.get("T:ScanStatus") == "idle" and client.get("T:ImagesPlanned") == -1
