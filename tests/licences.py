@@ -84,7 +84,7 @@ def brought(requirements: Iterable[Requirement]) -> dict[str, Distribution]:
     while to_do:
         requirement = to_do.pop()
         name = key(requirement.name)
-        if (name, frozenset(requirement.extras)) in done:
+        if name == "splatline" or (name, frozenset(requirement.extras)) in done:
             continue
         done.add((name, frozenset(requirement.extras)))
         try:
