@@ -133,8 +133,8 @@ def finish(
         volume: voxels of the Gaussians, 1/mm.
         gaussians: result of a fit to the views.
         problem: the views that were fitted, and the weights of their rays.
-        sweeps: of total variation, 1 or more; None: 8, and steps with sparse patches where these predict
-            views held out better.
+        sweeps: of total variation, 1 or more; None: 8, and a pull to few materials or steps with sparse patches where
+            these predict views held out better.
         settings: of the fit; None: the defaults.
         control: gets each sweep, also those of trials, and is asked after it whether to stop. Its decisions may
             hold the prior.

@@ -45,8 +45,8 @@ class R2(Fit):
         early_stop: end the fit when the residual of views held out has not fallen for a while, and return the model
         with the lowest residual.
         finish: sweeps over the views after the fit that refine its volume on voxels, see `finish.finish`; None gives 8,
-            and steps with sparse patches as views held out prefer. The result's `gaussians` stay the model as it was
-            fitted.
+            and a pull to few materials or steps with sparse patches as views held out prefer. The result's
+            `gaussians` stay the model as it was fitted.
         allow_negative: the finish keeps voxels below zero; Gaussians have none.
         fit: weights, rates and limits.
     """

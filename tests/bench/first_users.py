@@ -180,7 +180,7 @@ def play(cell: Cell, name: str, value: Value, limit: float) -> Score | None:
         theirs.close()
         process.join()
         if process.exitcode == -signal.SIGXCPU:
-            return Score(*[None] * 6, limit, 0.0)
+            return Score(None, None, None, None, None, None, limit, 0.0)
         if process.exitcode:
             print(f"{cell} {name}: ended with status {process.exitcode}", file=sys.stderr, flush=True)
             return None

@@ -183,8 +183,9 @@ def _of_material(record: ReconRecord, number: int) -> ReconRecord:
     from recon.base.volume import Volume
     from recon.voxels.priors import PULLS
 
-    pulled: Any = next(getattr(loaded(entry.module), entry.cls) for entry in PULLS.values())
-    shares = None if record.kind is VoxelKind.SHARE else pulled.probabilities(record.volume, record.settings)
+    pulled: Any = next((getattr(loaded(entry.module), entry.cls) for entry in PULLS.values()), None)
+    known = pulled is not None and record.kind is not VoxelKind.SHARE
+    shares = pulled.probabilities(record.volume, record.settings) if known else None
     if shares is None:
         raise DataError(
             "--material: this volume was not pulled to few materials. Discrete and the finish of r2 do so where views "

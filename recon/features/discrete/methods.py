@@ -52,7 +52,7 @@ class Discrete(VoxelMethod):
     label: ClassVar[str] = "Discrete"
     takes: ClassVar[frozenset[str]] = frozenset({"device"})
     halo: ClassVar[int] = FistaTv.halo + 12
-    error_bars: ClassVar[tuple[float, float] | None] = 2.2, 0.1
+    error_bars: ClassVar[tuple[float, float] | None] = 3.0, 0.2
     buffers: ClassVar[Buffers] = Buffers(9.6, 3.0, 4.8, filtered=True)
     first_sweeps: ClassVar[int] = FistaTv.iterations
 
