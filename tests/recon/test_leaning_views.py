@@ -22,7 +22,7 @@ AXES, CENTRE = np.array([0.4, 0.3, 0.25]), np.array([0.08, -0.1, 0.06])
 GRID = recon.Grid((28, 32, 32), 0.04)
 ANGLES = np.arange(32) * 2 * np.pi / 32
 # Their rays are those of r2 and fista-tv.
-QUICK = "fbp", "cgls", "fista-tv"
+QUICK = "fbp", "cgls"
 CONES = "r2", "fbp", "sirt"  # whose rays of a cone are those of the others
 LIKE_OTHERS = "r2-published", "series"
 SHORT = {

@@ -22,6 +22,7 @@ from simulators.devices.clock import ScaledClock, VirtualClock
 from simulators.frame.shot import Detector
 from simulators.scenes.scene import load_scene
 from tests.beamline.ball_scan import BALL, COMMON, STAGES, fly, shipped, small
+from tests.slow_cases import others_slow
 
 pytestmark = pytest.mark.usefixtures("simulated_zaber")
 
@@ -38,7 +39,7 @@ def assert_pictures(images: NDArray[np.uint16], block: Block) -> None:
     assert np.abs(images - exact).max() <= 0.5 + 1e-6 * exact.max()
 
 
-@pytest.mark.parametrize("stage", STAGES.values(), ids=STAGES)
+@pytest.mark.parametrize("stage", others_slow(STAGES.values(), 4), ids=STAGES)
 def test_every_stage_gives_the_planned_angles(stage: str) -> None:
     """The stand-in of each controller behind the same configuration: as many frames as pulses, each from its count."""
     settings = small(

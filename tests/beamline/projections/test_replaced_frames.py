@@ -54,7 +54,8 @@ def test_any_group_or_frame_of_another_kind_is_named_or_refused(
     assert told and all(f"The {kind.name.lower()}s " in line and "used instead" in line for line in told)
 
 
-@pytest.mark.parametrize("n", others_slow([3, 5, 10]))
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [3, 5, 10])
 def test_one_lit_dark_does_not_change_a_volume(n: int) -> None:
     for share in (1.0, 0.5):
         blocks = Blocks(1, n)

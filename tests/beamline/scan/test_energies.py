@@ -93,7 +93,8 @@ def test_each_energy_has_a_scan(config: Path, tmp_path: Path) -> None:
     assert all(f"{series.name}/{path.parent.name}" in listed for path in scans), listed
 
 
-@pytest.mark.parametrize("at", [22 + 2, *(pytest.param(at, marks=pytest.mark.slow) for at in (3, 22 + 14))])
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [22 + 2, 3, 22 + 14])
 def test_a_series_that_was_stopped_goes_on(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:

@@ -25,6 +25,7 @@ from tests.beamline.scan.chains import (
     assert_whole,
     rows_of,
 )
+from tests.slow_cases import others_slow
 
 
 @pytest.fixture(scope="module")
@@ -77,12 +78,14 @@ def _without_its_parts(run: Path) -> None:
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [
-        (_fewer_frames, "part-2/scan.h5 has .* frames, not the"),
-        (_gone, "part-3/scan.h5 is not there"),
-        (_torn, "is cut off"),
-        (_without_its_parts, "does not say what its parts are"),
-    ],
+    others_slow(
+        [
+            (_fewer_frames, "part-2/scan.h5 has .* frames, not the"),
+            (_gone, "part-3/scan.h5 is not there"),
+            (_torn, "is cut off"),
+            (_without_its_parts, "does not say what its parts are"),
+        ]
+    ),
 )
 def test_a_joined_file_whose_parts_changed_is_refused_and_made_again(
     recovered: Path, change: Callable[[Path], None], said: str

@@ -136,7 +136,11 @@ def test_a_cone_is_refused() -> None:
         dry_run(with_scene(asked(*WIDE), cone))
 
 
-@pytest.mark.parametrize("words", [(), ("scan.mode=fly",), (motor(-1.0),)], ids=["step", "fly", "motor"])
+@pytest.mark.parametrize(
+    "words",
+    [(), *(pytest.param((word,), marks=pytest.mark.slow) for word in ("scan.mode=fly", motor(-1.0)))],
+    ids=["step", "fly", "motor"],
+)
 def test_triggers_frames_and_rows_are_one(words: tuple[str, ...], tmp_path: Path) -> None:
     events: list[Event] = []
     scan = run_scan(asked(*WIDE, *words), tmp_path, [events.append])

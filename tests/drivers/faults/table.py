@@ -11,6 +11,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import pytest
+
 from beamline.core.errors import ConfigError
 from beamline.scan.ledger import LedgerError
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
@@ -109,6 +111,11 @@ def phases_of(kind: str, phases: Sequence[Phase]) -> Sequence[Phase]:
     """Those of the phases in which a fault is tried on a controller: on the first in each, the others share them."""
     n = list(KINDS).index(kind)
     return phases if n == 0 or len(phases) == 1 else phases[n - 1 :: len(KINDS) - 1]
+
+
+def slow_but(kind: str) -> list[pytest.MarkDecorator]:
+    """No mark for the first controller; the others are slow."""
+    return [pytest.mark.slow] * (kind != next(iter(KINDS)))
 
 
 UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"

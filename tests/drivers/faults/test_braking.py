@@ -14,6 +14,7 @@ from beamline.core.errors import ScanStopped
 from beamline.core.stop import StopRequest
 from drivers.base.frame import FrameKind
 from tests.drivers.faults.rig import DARKS, FIRST, FLATS, KINDS, STEP, Rig, Scanned
+from tests.slow_cases import others_slow
 
 RigOf = Callable[[str], Rig]
 VIEWS, PERIOD = 60, 0.08
@@ -69,7 +70,7 @@ def check(rig: Rig, runs: Path, seed: int) -> None:
     assert len(missing) <= pulses, seed
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", others_slow(KINDS))
 def test_noise_while_the_stage_brakes_shifts_no_angle(rig_of: RigOf, tmp_path: Path, kind: str) -> None:
     check(rig_of(kind), tmp_path, seed=7)
 
@@ -81,7 +82,7 @@ def test_a_dozen_schedules_of_noise_while_the_stage_brakes(rig_of: RigOf, tmp_pa
         check(rig_of(kind), tmp_path / str(seed), seed)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", others_slow(KINDS))
 def test_without_noise_every_view_until_the_stage_stands_is_kept(rig_of: RigOf, tmp_path: Path, kind: str) -> None:
     scanned, off, last = stopped(rig_of(kind), tmp_path, 4, 0)
     assert max(off) < 0.01

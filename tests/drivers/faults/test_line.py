@@ -39,7 +39,7 @@ def test_without_a_fault_a_scan_is_complete(rig_of: RigOf, kind: str, tmp_path: 
 @pytest.mark.parametrize(
     ("row", "kind", "phase"),
     [
-        pytest.param(row, kind, phase, id=f"{row.fault}-{kind}-{phase.name.lower()}")
+        pytest.param(row, kind, phase, id=f"{row.fault}-{kind}-{phase.name.lower()}", marks=table.slow_but(kind))
         for row in table.LINE
         for kind in KINDS
         if kind not in row.not_on
@@ -73,7 +73,7 @@ def test_one_bad_reply(rig_of: RigOf, row: table.LineFault, kind: str, phase: Ph
 @pytest.mark.parametrize(
     ("kind", "phase"),
     [
-        pytest.param(kind, phase, id=f"{kind}-{phase.name.lower()}")
+        pytest.param(kind, phase, id=f"{kind}-{phase.name.lower()}", marks=table.slow_but(kind))
         for kind in KINDS
         for phase in table.phases_of(kind, list(Phase))
     ],

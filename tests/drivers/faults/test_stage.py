@@ -42,7 +42,7 @@ def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: s
     assert_next_scan_works(rig, tmp_path, row.flags.get(kind, ""))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", others_slow(KINDS))
 @pytest.mark.parametrize("row", table.MOTION[:2], ids=lambda row: row.fault)
 def test_a_stage_that_stops_early_in_a_step_scan(
     rig_of: RigOf, row: table.MotionFault, kind: str, tmp_path: Path
@@ -59,7 +59,7 @@ def test_a_stage_that_stops_early_in_a_step_scan(
     assert_kept(scanned, list(range(6)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", others_slow(KINDS))
 @pytest.mark.parametrize("row", table.PULSES, ids=lambda row: row.fault)
 def test_a_trigger_cable_that_loses_or_picks_up_pulses(
     rig_of: RigOf, row: table.PulseFault, kind: str, tmp_path: Path

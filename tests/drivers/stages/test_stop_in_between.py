@@ -14,6 +14,7 @@ from drivers.testing.stages.bench import LONG, SPEED
 from simulators.wires.wire import register
 from tests.drivers.stages.rig import NAMES, StageRig
 from tests.drivers.stages.rigs import RigOf, every_stage
+from tests.slow_cases import others_slow
 
 
 class StopInBetween:
@@ -66,7 +67,7 @@ class StopInBetween:
         return self._answers >= self._at
 
 
-@pytest.mark.parametrize("begin", ["move", "search"])
+@pytest.mark.parametrize("begin", others_slow(["move", "search"]))
 @pytest.mark.parametrize("hard", [False, True], ids=["stop", "abort"])
 @every_stage
 def test_a_stop_at_any_moment_of_a_moves_beginning_wins(rig_of: RigOf, hard: bool, begin: str) -> None:

@@ -174,6 +174,7 @@ _ON = cpu()
 exponents = st.floats(-4, 4)
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(
     shape=st.tuples(exponents, exponents, exponents),

@@ -29,6 +29,7 @@ from simulators.samples.bodies.solids import (
 from tests.refused_calls import refused_calls
 from tests.simulators import bodies
 from tests.simulators.bodies import SOLIDS, inside
+from tests.slow_cases import others_slow
 
 
 def _widest_shadow(phantom: Phantom, detector: Detector) -> float:
@@ -38,7 +39,7 @@ def _widest_shadow(phantom: Phantom, detector: Detector) -> float:
     return max(float(u[(view > 0).any(axis=0)].max()) for view in views)
 
 
-@pytest.mark.parametrize("name", SOLIDS)
+@pytest.mark.parametrize("name", others_slow(SOLIDS, 4))
 def test_the_radius_is_the_widest_shadow(name: str) -> None:
     pitch = 2e-3
     phantom = Phantom.of([SOLIDS[name]])
