@@ -155,7 +155,7 @@ def _interval(
     voxels = of_voxels * abs(wide - value)
     half = max(math.hypot(np.nan_to_num(views), levels, voxels), NARROWEST * abs(value))
     middle = value + float(np.nan_to_num(moves))
-    low, high = max(middle - half, 0.0), middle + half
+    low, high = max(middle - half, float(kind == "tortuosity")), middle + half
     if kind in _SHARES:
         high = min(high, 1.0)
     why = ""

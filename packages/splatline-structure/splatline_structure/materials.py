@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ F64 = NDArray[np.float64]
 Labels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
-_ROUNDS = 4
+_ROUNDS, _LOOKED_AT = 4, 160  # voxels of a side of the cube in the middle that shows the levels
 _CORE = 2  # voxels from an edge from which on a voxel shows the level of its material
 _TRIMMED = 0.02  # share of a core's voxels left out at each end: specks of others
 _LEAST = 200  # voxels of a core, else the outer quarter of the material's values shows the level
@@ -47,14 +48,20 @@ class Materials:
         return (self.levels[1:] + self.levels[:-1]) / 2
 
 
+def central(mask: NDArray[Any], side: int) -> NDArray[Any]:
+    """The cube of `side` voxels in the middle, cut to the volume."""
+    return mask[tuple(slice(max((n - side) // 2, 0), max((n - side) // 2, 0) + min(side, n)) for n in mask.shape)]
+
+
 def materials_of(volume: F32, count: int, seed: int = 0) -> Materials:
     """Levels of `count` materials: k-means, then the mean of each material's voxels more than two voxels from its edge.
 
-    Partial voxels lie between levels: they take no part.
+    Partial voxels lie between levels: they take no part. Of a large volume the 160³ voxels in the middle are looked at.
 
     Raises:
         ValueError: one value, or no contrast between two materials.
     """
+    volume = central(volume, _LOOKED_AT)
     levels = clusters(volume, count, seed).centres
     for _ in range(_ROUNDS):
         labels = labelled(volume, (levels[1:] + levels[:-1]) / 2)

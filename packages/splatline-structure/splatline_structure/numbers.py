@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from splatline_structure.materials import F32, F64, Labels, labelled
+from splatline_structure.materials import F32, F64, Labels, central, labelled
 from splatline_structure.particles import NECK, Numbers, Particles, Spacing, cleaned, measured, parted, surfaces
 from splatline_structure.transport import connecting, tortuosity
 
@@ -94,11 +94,6 @@ def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -
         if rules.side:
             numbers[f"tortuosity_{name}"] = tortuosity(central(through, rules.side), axis)
     return Structure(labels, numbered, particles, numbers, mask.mean(axis=(1, 2)), _radial(mask, spacing))
-
-
-def central(mask: np.ndarray, side: int) -> np.ndarray:
-    """The cube of `side` voxels in the middle, cut to the volume."""
-    return mask[tuple(slice(max((n - side) // 2, 0), max((n - side) // 2, 0) + min(side, n)) for n in mask.shape)]
 
 
 def coarse(volume: F32) -> F32:

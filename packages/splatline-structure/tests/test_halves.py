@@ -32,6 +32,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_halves_of_the_volumes_own_scan_are_made(here: Path) -> None:
     assert beamline("recon", "scan.h5", "-m", "fbp", "--no-report", "-o", "v.h5").exit_code == 0
     result = beamline("structure", "v.h5", "--side", "24", "--json")
@@ -45,6 +46,17 @@ def test_halves_of_the_volumes_own_scan_are_made(here: Path) -> None:
     assert {"v.h5", "scan.h5", "v_structure"} == left(here)
 
 
+@pytest.mark.slow
+def test_halves_of_a_scan_without_pixel_size_are_in_the_volumes_unit(here: Path) -> None:
+    """They were 1/mm beside a volume in 1/px, and thresholds lay off by 27 gaps of levels."""
+    with h5py.File("scan.h5", "r+") as file:
+        del file.attrs["pixel_size_mm"]
+    assert beamline("recon", "scan.h5", "-m", "fbp", "--no-report", "-o", "v.h5").exit_code == 0
+    result = beamline("structure", "v.h5", "--voxel-um", "2", "--side", "0", "--json")
+    assert json.loads(result.stdout.splitlines()[-1])["thresholds_off"] < 0.1
+
+
+@pytest.mark.slow
 def test_intervals_against_views_are_wider_for_fewer(here: Path) -> None:
     words = ("-m", "fbp", "--number", "fraction_2", "--number", "surface")
     result = beamline("structure-study", "scan.h5", "--views", "16,64", *words)
