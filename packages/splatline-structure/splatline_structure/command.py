@@ -218,10 +218,13 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
         "report.html": results.page(title, undecided, [], shown, table, settings),
         "numbers.csv": results.numbers_table(table),
         "structure.json": results.json_text(states[0] if len(seen) == 1 else {"states": states}),
-        "particles.csv": results.particles_table(particles),
+        "particles.csv": results.particles_table(particles, first.grid),
     }
     suffix = _SUFFIXES[values["labels"]]
-    labels = {f"materials{suffix}": found.structure.labels + 1, f"particles{suffix}": found.structure.numbered}
+    labels: dict[str, Any] = {
+        f"materials{suffix}": found.structure.labels + 1,
+        f"particles{suffix}": found.structure.numbered,
+    }
     with atomic_file(output) as partial:
         results.write_all(partial, texts, labels, first.record, first.grid)
     answer.done({"output": output, **states[0]}, title, *results.lines_of(table), undecided, f"output  {output}")

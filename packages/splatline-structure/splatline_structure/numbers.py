@@ -89,7 +89,7 @@ def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -
     numbers["cracks"] = _mean(~mask[inside])
     through = labels == rules.through - 1
     for axis, name in enumerate("zyx"):
-        share = np.count_nonzero(connecting(through, axis)) / max(np.count_nonzero(through), 1)
+        share = int(connecting(through, axis).sum()) / max(int(through.sum()), 1)
         numbers[f"connected_{name}"] = share if through.any() else math.nan
         if rules.side:
             numbers[f"tortuosity_{name}"] = tortuosity(central(through, rules.side), axis)

@@ -134,7 +134,8 @@ def measured(labels: Numbers, spacing: Spacing = (1, 1, 1), origin: Spacing = (0
             touching[a].add(b)
             touching[b].add(a)
     return Particles(
-        number.astype(np.int32), counts[number] * math.prod(spacing), surfaces(labels, spacing)[number], centroid,
+        number.astype(np.int32), (counts[number] * math.prod(spacing)).astype(np.float64),
+        surfaces(labels, spacing)[number], centroid,
         np.isin(number, np.concatenate(faces)), tuple(tuple(sorted(touching[each])) for each in number.tolist()),
     )  # fmt: skip
 

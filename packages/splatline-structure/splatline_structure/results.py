@@ -49,12 +49,13 @@ def numbers_table(intervals: Mapping[str, Interval]) -> str:
     return csv_text([list(COLUMNS), *(cells(name, each) for name, each in intervals.items())])
 
 
-def particles_table(particles: Particles) -> str:
-    """A row for each particle, the largest first."""
+def particles_table(particles: Particles, grid: Grid) -> str:
+    """A row for each particle, the largest first; places are those of the volume's axes."""
+    first = 1e3 * np.array(grid.first)
     head = "label", "volume_um3", "diameter_um", "sphericity", "z_um", "y_um", "x_um", "cut", "contacts", "neighbours"
     rows: list[Sequence[object]] = [head]
     for i in np.argsort(-particles.volume, kind="stable").tolist():
-        sizes = particles.volume[i], particles.diameter[i], particles.sphericity[i], *particles.centroid[i]
+        sizes = particles.volume[i], particles.diameter[i], particles.sphericity[i], *(particles.centroid[i] + first)
         neighbours = particles.neighbours[i]
         shown = [f"{each:.6g}" for each in sizes]
         rows.append(

@@ -53,7 +53,14 @@ def structure_study(
     from splatline_structure.particles import NECK
 
     output = output or Path(f"{safe_name(scan.name.split('.')[0])}_views")
-    values = {"materials": materials, "particles": None, "slices": None, "parts": None, "scan": scan, "quick": False}
+    values: dict[str, Any] = {
+        "materials": materials,
+        "particles": None,
+        "slices": None,
+        "parts": None,
+        "scan": scan,
+        "quick": False,
+    }
     values |= {"crop": "square", "radius": 1, "smallest": 27, "neck": NECK, "side": 96, "through": 1}
     with answering(as_json) as answer:
         refuse_existing(output)

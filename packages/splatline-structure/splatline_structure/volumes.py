@@ -147,7 +147,7 @@ def parts_of(
         DataError, ConfigError: the scan cannot be read or prepared. ValueError: the method takes no such views.
     """
     facts = record.parameters
-    rows = None if facts.get("rows", "all") == "all" else tuple(map(int, str(facts["rows"]).split(":")))
+    rows: Any = None if facts.get("rows", "all") == "all" else tuple(map(int, str(facts["rows"]).split(":")))
     selection = Selection(
         views=str(facts.get("views", "all")), rows=rows, binning=int(facts.get("binning", 1)), axis_col=record.axis_col,
     )  # fmt: skip
