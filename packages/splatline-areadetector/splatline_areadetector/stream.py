@@ -28,7 +28,7 @@ from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.text import size
 from drivers.base.errors import DeviceTimeout
 from splatline_areadetector.arrays import ArrayFrame, array_frame
-from splatline_areadetector.receiver import frame_of
+from splatline_areadetector.receiver import HEAD, frame_of
 
 SCHEME = "pva://"
 _LEAST, _MOST = 4, 1000  # frames of the queue
@@ -142,6 +142,11 @@ class FrameStream:
             self.first = array_frame(value, time.time(), is_current=True)
             self.queue = queues.frames(0 if self.first is None else self.first.n_bytes, period)
             self._n_bytes, self._died_at = int(1e6 * queues.ring_megabytes), math.nan
+            if self.first is not None and self._n_bytes < 2 * (self.first.n_bytes + 2 * HEAD):
+                raise ConfigError(
+                    f"ring_mb is {queues.ring_megabytes:g}, which has no room for two frames of "
+                    f"{size(self.first.n_bytes)}: raise it. Nothing was started."
+                )
             self._start()
             self._reader = threading.Thread(target=self._read, name=f"receives {self.name}", daemon=True)
             self._reader.start()

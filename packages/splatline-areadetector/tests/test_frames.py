@@ -160,6 +160,13 @@ def test_a_receiver_that_dies_is_replaced_and_frames_that_are_held_stay(loopback
 
 
 @pytest.mark.usefixtures("loopback")
+def test_a_ring_without_room_for_two_frames_is_refused() -> None:
+    """The ride would wait for its first frame for ever."""
+    with FakeIoc() as ioc, pytest.raises(ConfigError, match=r"ring_mb is 0\.001, .* no room for two frames of 768 B"):
+        FrameStream(ioc.url, Queues(ring_megabytes=0.001))
+
+
+@pytest.mark.usefixtures("loopback")
 def test_a_full_ring_names_what_it_had_no_room_for_and_several_clients_lose_nothing() -> None:
     small = Queues(ring_megabytes=3 * (counts_of(1).nbytes + 2 * HEAD) / 1e6)
     with FakeIoc() as ioc, FrameStream(ioc.url) as whole, FrameStream(ioc.url, small) as stream:

@@ -130,17 +130,17 @@ def test_every_frame_of_two_minutes(tmp_path: Path, scan: Path, fps: int, second
 
 @pytest.mark.slow
 def test_the_page_shows_a_growing_volume_and_the_last_is_that_of_the_file(tmp_path: Path, scan: Path) -> None:
-    """At 10 frames/s, with three views interpolated between each two of the real scan, which would be over in 9 s."""
+    """At 10 frames/s, with seven views interpolated between each two of the real scan, which would be over in 9 s."""
     source = tmp_path / "finer.h5"
     with h5py.File(scan) as file, h5py.File(source, "w") as finer:
         views, *references = (file[f"/exchange/{name}"][:, ::2, ::2] for name in ("data", "data_dark", "data_white"))
         for name, images in zip(("data_dark", "data_white"), references, strict=True):
             finer[f"/exchange/{name}"] = images
         views = views.astype(float)
-        between = [views[:-1] + (views[1:] - views[:-1]) * k / 4 for k in range(4)]
+        between = [views[:-1] + (views[1:] - views[:-1]) * k / 8 for k in range(8)]
         finer["/exchange/data"] = np.rint(np.stack(between, 1)).reshape(-1, *views.shape[1:]).astype(np.uint16)
         n = len(finer["/exchange/data"])
-    angles = {"from": "plan", "views": n, "start_deg": 0, "step_deg": 0.5}
+    angles = {"from": "plan", "views": n, "start_deg": 0, "step_deg": 0.25}
     with served(source, 10, n / 10 + 4, 60):
         ride = Ride(
             tmp_path, "--page", "--darks", str(source), "--flats", str(source), period_s=0.1, queue_s=3, angles=angles
@@ -164,7 +164,7 @@ def test_the_page_shows_a_growing_volume_and_the_last_is_that_of_the_file(tmp_pa
     assert during < n, "the picture came after the last frame"
     (run,) = (tmp_path / "runs").glob("*/")
     (file,) = stored(tmp_path)
-    _equal_to_the_bit(file, source, 0.5)
+    _equal_to_the_bit(file, source, 0.25)
     assert file.ids.tolist() == [-1, -1, *range(1, n + 1)]
     command = [sys.executable, "-m", "beamline.cli.main", "recon", str(run / "scan.h5"), "-o", str(tmp_path / "r.h5")]
     subprocess.run([*command, "-m", "r2", "--seed", "0"], check=True, capture_output=True)
