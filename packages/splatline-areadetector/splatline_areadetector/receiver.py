@@ -146,7 +146,7 @@ def main(name: str, n_frames: str, word: str, n_bytes: str, n_present: str) -> N
 
     def write() -> None:
         while True:
-            sys.stdout.write(json.dumps(lines.get(), default=str) + "\n")
+            sys.stdout.write(json.dumps(lines.get(), default=str, allow_nan=True) + "\n")
             sys.stdout.flush()
 
     memory = opened_memory(word, int(n_bytes))

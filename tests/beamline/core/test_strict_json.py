@@ -19,6 +19,7 @@ from recon.base.volume import Grid, Volume
 ROOT = Path(recon.__file__).parents[1]
 EXACT = {
     "beamline/storage/writers/partial_volume.py": "what a resumed reconstruction takes back to the bit",
+    "packages/splatline-areadetector/splatline_areadetector/receiver.py": "attributes of frames, for a process of ours",
 }
 """Where NaN and infinities are written, for this program alone."""
 
