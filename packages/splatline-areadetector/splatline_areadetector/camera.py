@@ -153,7 +153,8 @@ class AreaDetectorCamera:
         rows, cols = self.timing.shape
         with self._changed:
             self._ring.clear()
-            self._ring_size = max(_LEAST_RING, self._own.ring // (2 * rows * cols))
+            # Half of the memory is for those that come and those that are written: else the newest would find no room.
+            self._ring_size = max(_LEAST_RING, self._own.ring // 2 // (2 * rows * cols))
             self._lost = self._overrun = 0
             self._problem, self._origin = None, 1 if labels.counted else None
             self._armed = True
