@@ -116,9 +116,11 @@ def _equal_to_the_bit(file: Stored, source: Path, step: float = 2.0) -> None:
     assert np.array_equal(file.triggers[views] - file.triggers[views][0], ids - ids[0])
 
 
-@pytest.mark.parametrize(("fps", "seconds"), [(10, 120), (50, 120)])
+@pytest.mark.parametrize(
+    ("fps", "seconds"), [(10, 20), *(pytest.param(fps, 120, marks=pytest.mark.long) for fps in (10, 50))]
+)
 @pytest.mark.slow
-def test_every_frame_of_two_minutes(tmp_path: Path, scan: Path, fps: int, seconds: int) -> None:
+def test_every_frame_once(tmp_path: Path, scan: Path, fps: int, seconds: int) -> None:
     n = fps * seconds
     with served(scan, fps, seconds + 5, 40):
         ride = Ride(tmp_path, "--no-live", "--darks", str(scan), "--flats", str(scan), **_views(n))
@@ -129,6 +131,7 @@ def test_every_frame_of_two_minutes(tmp_path: Path, scan: Path, fps: int, second
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_page_shows_a_growing_volume_and_the_last_is_that_of_the_file(tmp_path: Path, scan: Path) -> None:
     """At 10 frames/s, with seven views interpolated between each two of the real scan, which would be over in 9 s."""
     source = tmp_path / "finer.h5"

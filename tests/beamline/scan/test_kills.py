@@ -185,6 +185,7 @@ def test_kills_of_a_scan_that_decides(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_many_kills(tmp_path: Path) -> None:
     counted = kills(tmp_path, 4, 6, 0, [False, True])
     assert counted["recovered"] >= 12 and counted["resumed"] >= 2

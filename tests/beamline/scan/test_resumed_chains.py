@@ -43,7 +43,6 @@ from tests.beamline.scan.chains import (
     rows_of,
     views_of,
 )
-from tests.slow_cases import others_slow
 
 
 def _digest(path: Path) -> str:
@@ -199,7 +198,7 @@ class PartsOfARun(RuleBasedStateMachine):
 
 
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize(("runs", "steps"), others_slow([(3, 4), (9, 7)]))
+@pytest.mark.parametrize(("runs", "steps"), [(3, 4), pytest.param(9, 7, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_any_order(runs: int, steps: int) -> None:
     drawn = settings(max_examples=runs, stateful_step_count=steps, deadline=None, phases=[Phase.generate])
     run_state_machine_as_test(PartsOfARun, settings=drawn)

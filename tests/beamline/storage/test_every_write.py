@@ -14,7 +14,7 @@ import pytest
 
 from tests import faulty_disk
 
-pytestmark = [faulty_disk.needed, pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [faulty_disk.needed, pytest.mark.slow, pytest.mark.long, pytest.mark.timeout(900)]
 
 Row = dict[str, Any]
 

@@ -149,6 +149,7 @@ def _compile_all() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_triton_is_loaded_when_asked_for_and_compiles_every_kernel_for_cuda() -> None:
     if find_spec("triton") is None:
         pytest.skip("the GPU kernels need triton (extra gpu, Linux)")
