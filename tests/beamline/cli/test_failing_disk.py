@@ -21,7 +21,7 @@ from tests.beamline.scans import write_exchange
 
 Run = dict[str, Any]
 
-pytestmark = [faulty_disk.needed, pytest.mark.slow, pytest.mark.long, pytest.mark.timeout(900)]
+pytestmark = [faulty_disk.needed, pytest.mark.slow, pytest.mark.timeout(900)]
 
 FILES = {  # what each command writes
     "export volume.npy -o out/o.h5": {"o.h5"},

@@ -14,7 +14,7 @@ import pytest
 
 from tests import faulty_disk
 
-pytestmark = [faulty_disk.needed, pytest.mark.slow, pytest.mark.long, pytest.mark.timeout(900)]
+pytestmark = [faulty_disk.needed, pytest.mark.slow, pytest.mark.timeout(900)]
 
 Row = dict[str, Any]
 
@@ -53,6 +53,7 @@ def _assert_said_in_a_sentence(rows: list[Row]) -> None:
         assert row["stderr"] == "", row
 
 
+@pytest.mark.long
 def test_a_kill_at_each_of_the_last_writes_of_a_scan_or_a_disk_that_fails_from_one_on(tmp_path: Path) -> None:
     rows = _rows(tmp_path, "close")
     assert _counted(rows) == {"kill": 60, "error from": 25}
@@ -60,6 +61,7 @@ def test_a_kill_at_each_of_the_last_writes_of_a_scan_or_a_disk_that_fails_from_o
     _assert_said_in_a_sentence([row for row in rows if row["fault"] != "kill"])
 
 
+@pytest.mark.long
 def test_recover_is_killed_at_each_write_or_the_disk_fails_there(tmp_path: Path) -> None:
     rows = _rows(tmp_path, "recover")
     writes = _counted(rows)
