@@ -158,7 +158,7 @@ def main(name: str, n_frames: str, word: str, n_bytes: str, n_present: str) -> N
     while os.read(0, 1024):
         pass
     subscribed.close()
-    os._exit(0)  # the thread that writes may wait for whoever has died
+    os._exit(0)  # the thread that writes may wait for a ride that has died
 
 
 if __name__ == "__main__":

@@ -242,7 +242,7 @@ class FrameStream:
                 for line in lines:
                     self._take(*json.loads(line))
             code, self._died_at = process.wait(), time.time()
-            if self._over or not self._ready.is_set():  # the first one: whoever waits for it says so
+            if self._over or not self._ready.is_set():  # the constructor waits for the first, and raises
                 self._ready.set()
                 return
             self._put(Died(code))
