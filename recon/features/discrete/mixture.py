@@ -29,8 +29,8 @@ NOISE, LEAST_NOISE, SPREAD = 0.2, 0.08, 0.06
 levels. 0.08 for 0.2 costs 0.2 dB at 60 views of 192 columns. Views held out prefer 0.08 there, by 1.4 %, and with 0.2
 they refuse few materials at 90 views of 256 columns: trials take 0.08 over the root of the share of total variation."""
 DOUBT = 0.16
-"""Error of a voxel near half way between two levels, over their gap, for `undecided_share`. Set on packed grains from 36
-views (2.2 % expected, 2.0 % wrong); from 20 views 3.3 % were expected, and 4.0 % are wrong."""
+"""Error of a voxel near half way between two levels, over their gap, for `undecided_share`. Set on packed grains
+from 36 views (2.2 % expected, 2.0 % wrong); from 20 views 3.3 % were expected, and 4.0 % are wrong."""
 THIN = 0.2
 """Over the gap of levels: what is one or two voxels thick and stands out by more before the pull is not pulled towards
 what is on both sides of it. Without, cracks of half a voxel to one voxel go from 0.97 to 0.90 of their depth by total
