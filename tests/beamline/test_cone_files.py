@@ -23,6 +23,7 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.direct import fdk
 from tests.beamline.cli.small_scan import beamline
+from tests.slow_cases import others_slow
 
 SOD, SDD, PITCH, SHAPE, AXIS = 40.0, 60.0, 0.03, (40, 48), 22.5
 BALL, CENTRE, MU = 0.2, (0.12, -0.05, 0.06), 1.5  # mm, (x, y, z), 1/mm
@@ -84,7 +85,7 @@ def test_a_cone_beam_file_gives_back_its_geometry_and_its_sample(scan: Path) -> 
         assert (weights * axis).sum() / weights.sum() == pytest.approx(expected, abs=0.1 * grid.voxel_size)
 
 
-@pytest.mark.parametrize(("stated", "told"), [(None, []), (AXIS - 2.3, ["than with the file's 20.20"])])
+@pytest.mark.parametrize(("stated", "told"), others_slow([(AXIS - 2.3, ["than with the file's 20.20"]), (None, [])]))
 def test_an_axis_that_is_not_stated_or_wrong_is_found_by_views_held_out(
     tmp_path: Path, stated: float | None, told: list[str]
 ) -> None:
@@ -118,8 +119,8 @@ def test_a_file_that_does_not_say_so_is_made_a_cone_by_words(tmp_path: Path) -> 
         assert prepare_projections(source, told, _never).geometry.is_cone
 
 
-@pytest.mark.parametrize("row", [24])
-def test_a_row_of_a_cone_is_shown_as_a_slice_at_its_height(scan: Path, row: int) -> None:
+def test_a_row_of_a_cone_is_shown_as_a_slice_at_its_height(scan: Path) -> None:
+    row = 24
     with closing(ShownScan(open_scan(scan))) as shown:
         assert shown.axis(row) == {"axis": AXIS, "said": "as the file states", "leans": False}
         tile = shown.fbp(row, AXIS, 0.0, TileRegion(0, 99, 0, 99), fast=False)

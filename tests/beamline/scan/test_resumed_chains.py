@@ -43,6 +43,7 @@ from tests.beamline.scan.chains import (
     rows_of,
     views_of,
 )
+from tests.slow_cases import others_slow
 
 
 def _digest(path: Path) -> str:
@@ -198,7 +199,7 @@ class PartsOfARun(RuleBasedStateMachine):
 
 
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize(("runs", "steps"), [(3, 4), pytest.param(9, 7, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.parametrize(("runs", "steps"), [(2, 4), pytest.param(9, 7, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_any_order(runs: int, steps: int) -> None:
     drawn = settings(max_examples=runs, stateful_step_count=steps, deadline=None, phases=[Phase.generate])
     run_state_machine_as_test(PartsOfARun, settings=drawn)
@@ -206,13 +207,16 @@ def test_any_order(runs: int, steps: int) -> None:
 
 @pytest.mark.parametrize(
     ("mode", "steps"),
-    [
-        ("step", [("killed", VIEW), ("killed", VIEW), ("stopped", START)]),
-        ("fly", [("killed", DARKS), ("failed", VIEW), ("killed", DARKS)]),
-        ("interlaced", [("stopped", VIEW), ("unjoined_whole", START)]),
-        ("backwards", [("aborted", LAST), ("aborted", START), ("killed", 0)]),  # references of the end alone
-        ("fly", [("lossy", FIRST + 2), ("full", DARKS), ("aborted", VIEW)]),
-    ],
+    others_slow(
+        [
+            ("step", [("killed", VIEW), ("killed", VIEW), ("stopped", START)]),
+            ("fly", [("lossy", FIRST + 2), ("full", DARKS), ("aborted", VIEW)]),
+            ("fly", [("killed", DARKS), ("failed", VIEW), ("killed", DARKS)]),
+            ("interlaced", [("stopped", VIEW), ("unjoined_whole", START)]),
+            ("backwards", [("aborted", LAST), ("aborted", START), ("killed", 0)]),  # references of the end alone
+        ],
+        2,
+    ),
 )
 def test_named_orders(mode: str, steps: list[tuple[str, int]]) -> None:
     made = PartsOfARun()

@@ -132,7 +132,7 @@ def of_all_but_one(clean: F32) -> F32:
         return fitted(without, steps=60, finish=0).volume.data
 
 
-@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3]))
+@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 3e3]))
 def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, of_all_but_one: F32, value: float) -> None:
     # It may have no part in where the first Gaussians are placed, nor in how dense they are.
     wild = clean.copy()

@@ -326,7 +326,7 @@ def test_misuse_is_named() -> None:
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
     ("weight", "pitch"),
-    others_slow([(1e-40, 1.0), (3e38, 1.0), (1e20, 1e-12), (1e-20, 1.0), (1e20, 1.0), (1.0, 1e8), (1.0, 1e-12)], 3),
+    others_slow([(1e-40, 1.0), (1e20, 1e-12), (3e38, 1.0), (1.0, 1e8)], 2),
 )
 def test_units_do_not_matter(method: Any, weight: float, pitch: float) -> None:
     """Lengths, weights: only their ratios count, however far float32's squares would be out of range."""

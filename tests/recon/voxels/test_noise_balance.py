@@ -105,8 +105,7 @@ def test_nothing_is_changed_by_a_residual_that_says_nothing() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.02, 0.08])
-@pytest.mark.parametrize("method", [FistaTv(), OsSirtTv()], ids=["fista-tv", "os-sirt-tv"])
+@pytest.mark.parametrize(("method", "sigma"), [(FistaTv(), 0.02), (OsSirtTv(), 0.08)], ids=["fista-tv", "os-sirt-tv"])
 def test_its_volume_is_near_that_of_the_best_weight(method: FistaTv | OsSirtTv, sigma: float) -> None:
     (truth, clean), projector = _grains(), Projector(VIEWS, GRID)
     data = clean + np.random.default_rng(1).normal(0, sigma, clean.shape).astype(np.float32)
