@@ -130,6 +130,7 @@ def test_a_series_that_was_stopped_goes_on(
     assert other.exit_code == 2 and "`- 8.32`, not `- 8.3`" in other.stderr.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_a_scan_that_cannot_be_read_is_moved_away_and_taken_anew(config: Path, tmp_path: Path) -> None:
     """A writer that dies before its first frame leaves a file that nothing recovers."""
     words = ("--set", "scan.energies=[8.32, 8.345]")

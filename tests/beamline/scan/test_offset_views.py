@@ -220,7 +220,8 @@ def test_stepped_views_of_another_program_come_by_poses(wide_scan: Path, tmp_pat
     assert other.projections.data == pytest.approx(views.projections.data)
 
 
-@pytest.mark.parametrize("at", others_slow(["offset_view", "projection"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("at", ["offset_view", "projection"])
 def test_a_scan_that_is_resumed_has_them_and_its_copy_too(at: str, tmp_path: Path) -> None:
     stop = StopRequest()
 

@@ -78,7 +78,7 @@ def frames_of(path: Path) -> list[Frame]:
         return list(source.frames())
 
 
-@pytest.mark.parametrize("mode", others_slow(MODES, 2))
+@pytest.mark.parametrize("mode", others_slow(MODES))
 @settings(max_examples=2, deadline=None)
 @given(script=st.lists(st.sampled_from([Choice.NEXT, Choice.NEXT, Choice.AGAIN, Choice.OFFSET, Choice.ENOUGH])))
 @example(script=[Choice.AGAIN, Choice.OFFSET, Choice.ENOUGH])
@@ -249,10 +249,12 @@ def test_any_scan_that_is_killed_goes_on(mode: str, script: list[Choice], cuts: 
 
 @pytest.mark.parametrize(
     ("mode", "script", "cuts"),
-    [
-        ("fly", [Choice.ENOUGH], [FIRST + 6]),  # in the offset views
-        ("step", [Choice.AGAIN, Choice.OFFSET], [FIRST + 7, FIRST + 2]),
-    ],
+    others_slow(
+        [
+            ("fly", [Choice.ENOUGH], [FIRST + 6]),  # in the offset views
+            ("step", [Choice.AGAIN, Choice.OFFSET], [FIRST + 7, FIRST + 2]),
+        ]
+    ),
 )
 def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script: list[Choice], cuts: list[int]) -> None:
     words, pass_views, sizes = MODES[mode]

@@ -95,6 +95,7 @@ def _assert_told_of_parts(run: Path) -> None:
     assert (facts["missing_triggers"], facts["attributes"]["parts"]) == (0, "scan.h5, part-2/scan.h5")
 
 
+@pytest.mark.slow
 def test_the_views_of_all_parts_are_corrected_together(run: Path, tmp_path: Path) -> None:
     go_on(run)
     _assert_told_of_parts(run)

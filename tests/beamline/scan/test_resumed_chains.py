@@ -214,8 +214,7 @@ def test_any_order(runs: int, steps: int) -> None:
             ("fly", [("killed", DARKS), ("failed", VIEW), ("killed", DARKS)]),
             ("interlaced", [("stopped", VIEW), ("unjoined_whole", START)]),
             ("backwards", [("aborted", LAST), ("aborted", START), ("killed", 0)]),  # references of the end alone
-        ],
-        2,
+        ]
     ),
 )
 def test_named_orders(mode: str, steps: list[tuple[str, int]]) -> None:

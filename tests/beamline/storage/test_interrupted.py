@@ -18,7 +18,6 @@ from beamline.storage.writer_lock import WriterLock
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran, ended_run
 from tests.beamline.scan.test_resume import go_on
-from tests.slow_cases import others_slow
 
 AT = 10  # frames: in the views
 
@@ -84,7 +83,8 @@ def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_reco
         lock.release()
 
 
-@pytest.mark.parametrize("end", others_slow(["stopped", "aborted"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["stopped", "aborted"])
 def test_a_scan_that_ended_early_can_be_resumed_until_nothing_is_missing(tmp_path: Path, end: str) -> None:
     run = ended_run(tmp_path, end, at=AT)
     said = f"It ended early: `beamline scan --resume {run}` takes what is missing."

@@ -25,7 +25,8 @@ def _found(views: np.ndarray, angles: np.ndarray) -> TiltEstimate:
     return find_tilt(bands, first + 0.5 - (rows - 1) / 2, angles)
 
 
-@pytest.mark.parametrize("tilt", others_slow([2.0, 0.0]))
+@pytest.mark.slow
+@pytest.mark.parametrize("tilt", [2.0, 0.0])
 def test_a_tilt_is_found_within_its_uncertainty(tilt: float) -> None:
     """By levelled views, as `find_tilt` says, of three samples with noise of a tenth of the typical line integral."""
     misses = []
