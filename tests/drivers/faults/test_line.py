@@ -1,4 +1,4 @@
-"""Faults of the serial line, in every phase of a scan and on every controller."""
+"""Faults of the serial line on every controller, which share the phases of a scan; the plug is pulled in each."""
 
 from __future__ import annotations
 
