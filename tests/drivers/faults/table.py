@@ -119,7 +119,7 @@ def slow_but(kind: str) -> list[pytest.MarkDecorator]:
     return [pytest.mark.slow] * (kind != next(iter(KINDS)))
 
 
-def one_each(rows: Sequence[MotionFault] | Sequence[PulseFault]) -> list[Any]:
+def one_each(rows: Sequence[Any]) -> list[Any]:
     """For `parametrize`: each row with each controller, of which one is quick, another one for each row."""
     return [
         pytest.param(row, kind, id=f"{row.fault}-{kind}", marks=[pytest.mark.slow] * ((n - k) % len(KINDS) > 0))
