@@ -23,7 +23,6 @@ from recon.base.geometry import Geometry
 from recon.base.volume import Grid
 from recon.voxels.direct import fdk
 from tests.beamline.cli.small_scan import beamline
-from tests.slow_cases import others_slow
 
 SOD, SDD, PITCH, SHAPE, AXIS = 40.0, 60.0, 0.03, (40, 48), 22.5
 BALL, CENTRE, MU = 0.2, (0.12, -0.05, 0.06), 1.5  # mm, (x, y, z), 1/mm
@@ -85,9 +84,8 @@ def test_a_cone_beam_file_gives_back_its_geometry_and_its_sample(scan: Path) -> 
         assert (weights * axis).sum() / weights.sum() == pytest.approx(expected, abs=0.1 * grid.voxel_size)
 
 
-@pytest.mark.parametrize(
-    ("stated", "told"), others_slow([(AXIS - 2.3, ["than with the file's 20.20"]), (None, []), (AXIS, [])])
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("stated", "told"), [(AXIS - 2.3, ["than with the file's 20.20"]), (None, []), (AXIS, [])])
 def test_an_axis_is_found_or_kept_by_views_held_out(tmp_path: Path, stated: float | None, told: list[str]) -> None:
     path, warnings = tmp_path / "axis.h5", list[str]()
     _write(path, replace(INFO, axis_col=stated), views=24)

@@ -53,7 +53,8 @@ def test_the_axis_of_a_sample_wider_than_the_field() -> None:
     assert found.value == pytest.approx(41.8, abs=0.2) and found.confident
 
 
-@pytest.mark.parametrize("dark", others_slow([64, 72]))
+@pytest.mark.slow
+@pytest.mark.parametrize("dark", [64, 72])
 def test_the_axis_where_part_of_the_detector_has_no_beam(dark: int) -> None:
     """To half a column: the dark part counts as not measured; its pixels hold a wall."""
     n = 96

@@ -31,7 +31,7 @@ def test_a_model_can_be_continued_and_keeps_its_kernel(noisy: np.ndarray) -> Non
 
 
 def test_no_step_gives_the_starting_point(noisy: np.ndarray) -> None:
-    result = recon.reconstruct(noisy, VIEWS, R2(steps=0, gaussians=300))
+    result = recon.reconstruct(noisy, VIEWS, R2(steps=0, gaussians=300, finish=0))
     assert [p.step for p in result.history] == [0] and result.history[0].n_gaussians == 300
     assert result.gaussians is not None and result.volume.data.max() > 0
     # Scaled to the data: the sum of the volume is that of the line integrals.
@@ -133,7 +133,7 @@ def test_views_that_cannot_be_held_out_are_refused(noisy: np.ndarray, held_out: 
 
 
 def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
-    kept = recon.reconstruct(noisy, VIEWS, R2(steps=2, gaussians=100)).checkpoint
+    kept = recon.reconstruct(noisy, VIEWS, R2(steps=2, gaussians=100, finish=0)).checkpoint
     with pytest.raises(ValueError, match=r"least 2\d views"):
         recon.reconstruct(noisy[:12], VIEWS.select(range(12)), R2(steps=4), control=RunControl(resume=kept))
 

@@ -17,7 +17,7 @@ CONTEXT = ScanContext(saturation=65535, pixels=100)
 
 
 def test_a_clean_scan_raises_no_flag(fake: Any) -> None:
-    frames = fake.references() + fake.views(250) + fake.flats() + fake.darks()
+    frames = fake.references() + fake.views(120) + fake.flats() + fake.darks()
     assert fake.flags(frames) == []
 
 

@@ -360,7 +360,8 @@ def stopped(stop: StopRequest, passes: Passes) -> None:
     stop.stop()
 
 
-@pytest.mark.parametrize("mode", others_slow(["fly", "step"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["fly", "step"])
 def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -387,6 +388,7 @@ def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
             ...
 
 
+@pytest.mark.slow
 def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
