@@ -43,7 +43,6 @@ from tests.beamline.scan.chains import (
     rows_of,
     views_of,
 )
-from tests.slow_cases import others_slow
 
 
 def _digest(path: Path) -> str:
@@ -205,17 +204,16 @@ def test_any_order(runs: int, steps: int) -> None:
     run_state_machine_as_test(PartsOfARun, settings=drawn)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "steps"),
-    others_slow(
-        [
-            ("step", [("killed", VIEW), ("killed", VIEW), ("stopped", START)]),
-            ("fly", [("lossy", FIRST + 2), ("full", DARKS), ("aborted", VIEW)]),
-            ("fly", [("killed", DARKS), ("failed", VIEW), ("killed", DARKS)]),
-            ("interlaced", [("stopped", VIEW), ("unjoined_whole", START)]),
-            ("backwards", [("aborted", LAST), ("aborted", START), ("killed", 0)]),  # references of the end alone
-        ]
-    ),
+    [
+        ("step", [("killed", VIEW), ("killed", VIEW), ("stopped", START)]),
+        ("fly", [("lossy", FIRST + 2), ("full", DARKS), ("aborted", VIEW)]),
+        ("fly", [("killed", DARKS), ("failed", VIEW), ("killed", DARKS)]),
+        ("interlaced", [("stopped", VIEW), ("unjoined_whole", START)]),
+        ("backwards", [("aborted", LAST), ("aborted", START), ("killed", 0)]),  # references of the end alone
+    ],
 )
 def test_named_orders(mode: str, steps: list[tuple[str, int]]) -> None:
     made = PartsOfARun()
