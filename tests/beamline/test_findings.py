@@ -48,7 +48,7 @@ REAL = {
 }
 MADE = ("21", "31", "32", "34", "44", "45", "54", "57", "77", "78", "83", "91", "101", "102", "103", "107", "108",
         "111", "116", "121", "123", "132", "136", "138", "140", "152")  # fmt: skip
-QUICK_EACH = 20  # of the small scans
+QUICK_EACH = 40  # of the small scans
 GATE_EACH = 10  # of the cases in which nothing is said that no case before them has
 LONG = {15, 39, 45, 52, 55}  # clean scans of 720 views, beside two others of as many
 

@@ -290,6 +290,7 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         assert [finding for finding in validate(path, lambda done, of: None) if finding.severity == "error"] == []
 
 
+@pytest.mark.slow
 def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -275,7 +275,8 @@ def test_progress_stop_and_start(method: Any) -> None:
     np.testing.assert_array_equal(three.data, before)
 
 
-@pytest.mark.parametrize("weighed", others_slow([True, False]))
+@pytest.mark.slow
+@pytest.mark.parametrize("weighed", [True, False])
 def test_asd_pocs_without_a_goal_takes_one_from_the_direct_method(weighed: bool, rng: np.random.Generator) -> None:
     projector, _, views = parallel_case(n_views=20)
     given, weight, root = views, None, np.ones(views.shape)
