@@ -98,6 +98,7 @@ def test_an_output_is_right_or_absent(inputs: Path, commands: dict[str, set[str]
             assert right if run["code"] == 0 else not run["outputs"], run
 
 
+@pytest.mark.long
 def test_a_folder_of_results_holds_whole_files_and_the_trials_done(inputs: Path) -> None:
     for (clean, runs), trials in zip(_swept(inputs, FOLDERS), FOLDERS.values(), strict=True):
         assert set(clean["outputs"]) == {"o"}
