@@ -28,7 +28,7 @@ from tests.features import folders, table
 # How many examples property tests and fuzz run: HYPOTHESIS_PROFILE=thorough pytest tests/drivers -k fuzz
 # No deadline: a busy machine makes an example slow now and then; that is no fault of the code.
 # The default draws the same examples in every run, so that the gate's verdict repeats; the other profiles explore.
-settings.register_profile("few", deadline=None, derandomize=True, max_examples=50)
+settings.register_profile("few", deadline=None, derandomize=True, max_examples=25)
 settings.register_profile("explore", deadline=None, print_blob=True)
 settings.register_profile("ci", deadline=None, max_examples=500, print_blob=True)
 settings.register_profile("thorough", deadline=None, max_examples=10_000, print_blob=True)

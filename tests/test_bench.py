@@ -131,14 +131,6 @@ def test_hidden_detail(monkeypatch: Patch, tmp_path: Path) -> None:
     measured(bench.test_plastic_around_a_metal_wire, tmp_path, "FBP hann")
 
 
-def test_materials(monkeypatch: Patch) -> None:
-    pytest.importorskip("xraylib")
-    bench = script("test_materials")
-    small(monkeypatch, bench, SIDE=20, ROWS=2, WEIGHTS=(0.01,), SIX=(8.32, 8.3485, 8.352))
-    measured(bench.test_charge, bench.SIX, 8, 2000)
-    measured(bench.test_shifts, monkeypatch, 0.0)
-
-
 def test_monitor(monkeypatch: Patch, capsys: pytest.CaptureFixture[str]) -> None:
     cost, roc = script("test_monitor_cost"), script("test_monitor_roc")
     small(monkeypatch, cost, SHAPE=(512, 2048), WARM=2, VIEWS=3)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import grimp
 import numpy as np
+import pytest
 
 from tests.beamline.scans import TwoCylinders, write_exchange
 
@@ -69,6 +70,7 @@ def test_modules_that_load_torch_are_these() -> None:
     assert {name for name in by_name if not name.startswith("recon/kernels/gpu")} == LOAD
 
 
+@pytest.mark.slow
 def test_methods_on_voxels_looks_at_files_and_pages_work_without_torch(tmp_path: Path) -> None:
     write_exchange(tmp_path / "scan.h5", TwoCylinders(np.radians(np.arange(0, 180, 12.0)), shape=(1, 40)))
     lines = ["info scan.h5", "validate scan.h5", "recon scan.h5 -m fbp --dry-run", "recon scan.h5 -m fbp -o fbp.h5"]

@@ -28,8 +28,10 @@ def _views(axis_col: float, sod: float, sdd: float) -> NDArray[np.float32]:
     return balls.views(Geometry.cone(ANGLES, (ROWS, COLS), 1.0, sod, sdd, axis_col=axis_col))
 
 
-@pytest.mark.parametrize(("sod", "sdd"), others_slow([(SOD, SDD), (1e5, 1e5)]), ids=["cone", "nearly parallel"])
-@pytest.mark.parametrize(("start", "noise"), others_slow([(24.0, 0.3), (31.5, 0.3), (24.0, 0.0)]))
+@pytest.mark.parametrize(
+    ("sod", "sdd", "start", "noise"),
+    others_slow([(SOD, SDD, 24.0, 0.3), (1e5, 1e5, 31.5, 0.3), (SOD, SDD, 24.0, 0.0)]),  # 1e5: nearly parallel
+)
 def test_the_axis_is_found_to_a_tenth_of_a_column(sod: float, sdd: float, start: float, noise: float) -> None:
     views = _views(29.2, sod, sdd) + np.random.default_rng(1).normal(0, noise, (VIEWS, ROWS, COLS)).astype(np.float32)
     found = axis_by_views(views, Geometry.cone(ANGLES, (ROWS, COLS), 1.0, sod, sdd, axis_col=start))
@@ -51,7 +53,8 @@ def test_the_axis_of_a_sample_wider_than_the_field() -> None:
     assert found.value == pytest.approx(41.8, abs=0.2) and found.confident
 
 
-@pytest.mark.parametrize("dark", others_slow([64, 72]))
+@pytest.mark.slow
+@pytest.mark.parametrize("dark", [64, 72])
 def test_the_axis_where_part_of_the_detector_has_no_beam(dark: int) -> None:
     """To half a column: the dark part counts as not measured; its pixels hold a wall."""
     n = 96

@@ -84,7 +84,9 @@ def grey(path: Path) -> np.ndarray:
     ("name", "steady", "apart"),
     [
         ("first_reconstruction", slice(None), 0.01),
-        ("cost_of_accuracy", slice(-1), 0.01),  # the last figure of a line is a time
+        pytest.param(
+            "cost_of_accuracy", slice(-1), 0.01, marks=pytest.mark.long
+        ),  # the last figure of a line is a time
         ("streaming", slice(0), 0.05),  # a fit of so many seconds comes further on a faster machine
     ],
 )

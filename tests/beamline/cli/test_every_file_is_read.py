@@ -116,7 +116,7 @@ VOLUME_READERS = {
 
 
 @pytest.mark.parametrize("reader", VOLUME_READERS)
-@pytest.mark.parametrize("name", [*FLOATS, *(pytest.param(name, marks=pytest.mark.slow) for name in GREYS)])
+@pytest.mark.parametrize("name", [*FLOATS, "grey.tif", "grey.npy", "grey.zarr"])
 def test_volumes(written: Path, tmp_path: Path, name: str, reader: str) -> None:
     if name in GREYS and not name.endswith(".npy") and reader == "export":
         pytest.skip("refused with its reason: grey values of a window are not the volume")

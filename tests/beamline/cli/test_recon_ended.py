@@ -97,6 +97,7 @@ def test_an_fbp_that_is_interrupted_ends_at_once_and_leaves_nothing(
     assert set(folder.iterdir()) == before
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGHUP")
 def test_a_terminal_that_closes_does_not_end_what_nohup_keeps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _signal_at_step(monkeypatch, signal.SIGHUP, {5})

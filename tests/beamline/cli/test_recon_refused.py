@@ -32,6 +32,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_before_the_scan_is_read(fold
     assert "/proc cannot be written to" in result.stderr and "Nothing was read" in result.stderr
 
 
+@pytest.mark.slow
 def test_as_a_process(folder: Path) -> None:
     """The same through the operating system: exit code, streams, and no traceback."""
     root = Path(__file__).parents[3]

@@ -38,6 +38,7 @@ def said(command: Sequence[str], folder: Path, environment: dict[str, str] | Non
     return "".join(lines) + (folder / "stderr").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_watchdog_starts(tmp_path: Path, executed: Callable[[], list[str]]) -> None:
     (tmp_path / CONFIG).write_text(resolved_yaml(load(config_folder() / "instrument.yaml", (), {})))
     told: list[str] = []
@@ -46,6 +47,7 @@ def test_the_watchdog_starts(tmp_path: Path, executed: Callable[[], list[str]]) 
     assert (told, executed()) == ([], [])
 
 
+@pytest.mark.slow
 def test_what_they_start_is_as_safe(tmp_path: Path, executed: Callable[[], list[str]]) -> None:
     spawns = (
         "import multiprocessing as m, recon; p = m.get_context('spawn').Process(target=print, args=(recon.__file__,))"

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.stats import entropy as scipy_entropy
@@ -43,7 +43,6 @@ def naive_peaks(image: np.ndarray, valid: np.ndarray, bin_: int) -> np.ndarray:
     return np.where(np.isinf(low), np.nan, low)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     image=hnp.arrays(np.uint16, st.tuples(st.integers(1, 17), st.sampled_from([1, 7, 16, 17, 1024, 1027]))),
     preview_bin=st.sampled_from([1, 3, 4, 8, 12, 20]),
@@ -62,7 +61,6 @@ def naive_entropy(values: np.ndarray) -> float:
     return float(scipy_entropy(np.bincount(bins), base=2))
 
 
-@settings(max_examples=60, deadline=None)
 @given(image=counts, bin_=st.integers(1, 5), saturation=st.integers(0, 65535))
 def test_counts_agree_with_numpy(image: np.ndarray, bin_: int, saturation: int) -> None:
     found = digest(image, saturation=saturation, preview_bin=bin_)
@@ -112,7 +110,6 @@ def test_other_types_say_the_same_as_counts(dtype: type, rng: np.random.Generato
     np.testing.assert_allclose(found.preview, expected.preview, rtol=1e-6)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     image=hnp.arrays(
         np.float32,

@@ -5,7 +5,7 @@ Scans of balls by the formula of a sphere's chord, with photon noise, a beam wit
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -87,7 +87,6 @@ def test_views_that_show_nothing_beside_their_flats_are_named() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=20, deadline=None)
 @given(
     st.lists(
         st.tuples(st.floats(0, 1), st.floats(0, 6.28), st.floats(-6, 6), st.floats(3, 18), st.floats(0.1, 3)),

@@ -109,6 +109,7 @@ class Wide(Moved):
         return super()._frame(kind, row, light, angle if np.isnan(angle) else float(self.turns[int(angle)]))
 
 
+@pytest.mark.slow
 def test_a_wide_sample_in_passes_raises_no_flag_while_its_neighbours_are_far_and_shows_a_shift_later() -> None:
     """From one view of the first pass to the next, 4.5 degrees on, the field shows other matter."""
     flags = only(Wide(interlaced(320, 8)[:200], lambda view: (6.0 * (view >= 170), 0)))

@@ -194,7 +194,7 @@ def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatc
     ("name", "expected", "tolerance"),
     [
         ("diamond_24737_parallel_91x135x160.h5", 85.75, 0.5),
-        ("aps2bm_tooth_181x2x640.h5", 295.6, 0.5),
+        pytest.param("aps2bm_tooth_181x2x640.h5", 295.6, 0.5, marks=pytest.mark.long),
     ],
 )
 def test_axis_of_measured_scans(shared_data: Path, name: str, expected: float, tolerance: float) -> None:

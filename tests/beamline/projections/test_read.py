@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.projections.corrections.preparation import Preparation
@@ -36,7 +36,6 @@ def test_rows_of_all_frames_are_read_where_the_pieces_of_a_frame_are_too_many_to
     holes=st.floats(0, 0.9),
     seed=st.integers(0, 99),
 )
-@settings(max_examples=40, deadline=None)
 def test_bins_are_means_of_what_is_finite(rows: int, cols: int, binning: int, holes: float, seed: int) -> None:
     """Against a loop over the bins."""
     rng = np.random.default_rng(seed)

@@ -34,6 +34,7 @@ def test_the_file_s_axis_is_taken_and_a_finished_scan_followed(tmp_path: Path) -
     assert events[-1].data["axis_col"] == 20.25
 
 
+@pytest.mark.slow
 def test_the_axis_is_found_while_the_views_come(tmp_path: Path) -> None:
     clock, events = ScanClock(), list[Event]()
     schedule(clock, tmp_path / "scan.h5", frames_of(INTERLACED))

@@ -300,6 +300,7 @@ def test_iterations_become_volume_history_and_report(tmp_path: Path, method: str
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_walnut_from_60_views_is_better_than_fbp(tmp_path: Path, shared_data: Path) -> None:
     """Measured data (Meaney 2022), 8 rows: R² from 60 of 240 views beats FBP of these views by more than 1 dB."""
     events: list[Event] = []

@@ -96,9 +96,10 @@ def test_no_view_is_named_of_volumes_that_were_stopped_of_direct_methods_and_whe
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["r2", "os-sirt-tv"])
-@pytest.mark.parametrize("wider", [False, True])
-@pytest.mark.parametrize(("amount", "begun"), [(0.0, False), (1.0, True)])
+@pytest.mark.parametrize(
+    ("method", "wider", "amount", "begun"),
+    [("r2", False, 0.0, False), ("r2", True, 1.0, True), ("os-sirt-tv", True, 0.0, False)],
+)
 def test_a_volume_of_one_density_is_said_to_show_nothing(
     method: str, wider: bool, amount: float, begun: bool, rng: np.random.Generator
 ) -> None:

@@ -148,6 +148,7 @@ def test_a_dry_run_says_what_is_left(folder: Path, monkeypatch: pytest.MonkeyPat
     assert Path("out.partial.h5").read_bytes() == before and left(folder) == {"scan.h5", "out.partial.h5"}
 
 
+@pytest.mark.slow
 def test_a_partial_volume_in_the_way_of_a_run_without_slabs_stays(folder: Path) -> None:
     Path("out.partial.h5").write_text("of somebody else")
     result = beamline("recon", "scan.h5", "-m", "fbp", "--no-report", "--memory", "1G", "-o", "out.h5")

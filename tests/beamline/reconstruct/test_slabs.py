@@ -47,7 +47,6 @@ def volume(*options: str) -> np.ndarray:
     ("memory", "more"),
     [
         ("2M", ["--bin", "2"]),
-        pytest.param("3M", [], marks=pytest.mark.slow),
         pytest.param("3M", ["--rows", "33:181"], marks=pytest.mark.slow),
         pytest.param("3M", ["--air", "none"], marks=pytest.mark.slow),
     ],
@@ -97,7 +96,7 @@ def test_weights_of_pixels_that_measured_nothing_are_in_the_plan(tmp_path: Path)
     [
         (("fbp",), 40, 60, (400, 256)),
         (("os-sirt-tv", "--iterations", "2"), 44, 30, (320, 96)),
-        (("cgls", "--iterations", "2"), 56, 30, (200, 256)),
+        pytest.param(("cgls", "--iterations", "2"), 56, 30, (200, 256), marks=pytest.mark.long),
     ],
 )
 def test_no_more_memory_is_taken_than_was_given(
@@ -129,8 +128,8 @@ def test_no_more_memory_is_taken_than_was_given(
 @pytest.mark.parametrize(
     ("method", "more", "memory", "near"),
     [
-        ("sirt", ["--iterations", "4"], "20M", 1e-6),
-        ("fista-tv", ["--iterations", "5", "--tv-weight", "0.002"], "24M", 2e-3),
+        ("sirt", ["--iterations", "2"], "20M", 1e-6),
+        ("fista-tv", ["--iterations", "3", "--tv-weight", "0.002"], "24M", 2e-3),
     ],
 )
 def test_slabs_of_iterative_methods(tmp_path: Path, method: str, more: list[str], memory: str, near: float) -> None:

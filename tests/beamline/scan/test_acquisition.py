@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.core.errors import InstrumentError
@@ -60,7 +60,6 @@ def test_between_frames_of_a_view_the_stage_neither_moves_nor_settles() -> None:
     assert planned == pytest.approx(views[-1].time - views[0].time, abs=0.2)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.sets(st.integers(0, 23), max_size=5), st.sets(st.integers(0, 23), max_size=4), st.sampled_from([1, 2, 3]))
 def test_fly_any_lost_and_ignored_triggers_are_named(lost: set[int], ignored: set[int], passes: int) -> None:
     first = 5  # triggers before the views: 3 darks and 2 flats
@@ -87,7 +86,6 @@ def test_fly_any_lost_and_ignored_triggers_are_named(lost: set[int], ignored: se
     assert run.scan.missing == [first + i for i in gone if i < n]
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.sets(st.integers(0, 16)))
 def test_step_lost_frames_are_named_and_the_scan_goes_on(lost: set[int]) -> None:
     instrument = FakeInstrument(Faults(lost=lost))

@@ -29,6 +29,7 @@ from tests.beamline.ball_scan import COMMON, shipped, small, with_scene
 from tests.beamline.fakes import FakeInstrument
 from tests.drivers.soft_ioc import PREFIX, TickingClock, Variables, serve_pva
 from tests.refused_calls import refused_calls
+from tests.slow_cases import others_slow
 
 FILTER = "devices.filter={kind: simulated, places: [none, Al 1 mm]}"
 MONOCHROMATOR = "devices.monochromator={kind: simulated}"
@@ -86,10 +87,13 @@ DEVICES: dict[str, tuple[str, str, Any, Callable[[h5py.File, Any], None]]] = {
 
 @pytest.mark.parametrize(
     ("name", "asked", "written"),
-    [
-        ("filter", "Al 1 mm", "Al 1 mm"), ("filter", "null", "none"),
-        ("monochromator", "8.34", 8.34), ("monochromator", "null", 7.0),
-    ],
+    others_slow(
+        [
+            ("filter", "Al 1 mm", "Al 1 mm"), ("monochromator", "8.34", 8.34), ("filter", "null", "none"),
+            ("monochromator", "null", 7.0),
+        ],
+        2,
+    ),
 )  # fmt: skip
 def test_it_is_there_before_the_first_frame_and_in_the_file(
     tmp_path: Path, name: str, asked: str, written: Any

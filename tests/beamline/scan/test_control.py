@@ -23,6 +23,7 @@ from beamline.storage.run_record import RecordFile, RunRecord
 from tests.beamline.fakes import FakeInstrument
 from tests.beamline.ran import Ran
 from tests.clock import wait_until
+from tests.slow_cases import others_slow
 
 
 def asked(run: Path, verb: Verb) -> None:
@@ -87,7 +88,7 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
     assert running(Path("runs")) == []
 
 
-@pytest.mark.parametrize("size", [0, 10**9])  # of the log before; read whole, the larger one would take minutes
+@pytest.mark.parametrize("size", others_slow([10**9, 0]))  # of the log before; read whole, it would take minutes
 def test_what_is_measured_next_is_said_only_while_the_scan_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:

@@ -192,7 +192,7 @@ def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
     ran.assert_good_file(12, "complete")
 
 
-@pytest.mark.parametrize("verb", ["stop", "abort"])
+@pytest.mark.parametrize("verb", others_slow(["stop", "abort"]))
 def test_a_stop_or_an_abort_ends_the_question(tmp_path: Path, verb: str) -> None:
     stop = StopRequest()
 

@@ -17,6 +17,7 @@ from beamline.storage.readers.open import open_scan
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults, assert_true
 from tests.beamline.ran import Ran
+from tests.slow_cases import others_slow
 
 
 def flags(level: Level | None) -> tuple[Flag, ...]:
@@ -61,7 +62,7 @@ def test_a_policy_is_carried_out_after_so_many_frames_in_a_row(
 WORDS = ("scan.angles.views=40", "monitor.act_after=2", "scan.settle_s=0")
 
 
-@pytest.mark.parametrize("mode", ["step", "fly"])
+@pytest.mark.parametrize("mode", others_slow(["step", "fly"]))
 def test_an_alarm_pauses_a_scan_with_a_closed_shutter_until_it_is_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:

@@ -98,6 +98,7 @@ def test_a_joined_file_whose_parts_changed_is_refused_and_made_again(
         assert len(source.table) == len(rows_of(recovered.parent))
 
 
+@pytest.mark.slow
 def test_a_run_is_copied_as_a_whole_and_its_copy_needs_no_part(recovered: Path, tmp_path: Path) -> None:
     shutil.copytree(recovered.parent, tmp_path / "copy")
     assert_whole(tmp_path / "copy" / JOINED)

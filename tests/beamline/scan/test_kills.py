@@ -146,6 +146,7 @@ def _gone_on(run: Path) -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_a_few_kills(tmp_path: Path) -> None:
     counted = kills(tmp_path, 3, 1, 1, [False])
     assert counted["recovered"] + counted["whole"] + counted["none"] == 3

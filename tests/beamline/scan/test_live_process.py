@@ -112,8 +112,7 @@ def test_a_stop_ends_the_wait_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyP
                 "no axis",
             ),
             (lambda scan, output: [str(output / "no such program")], "could not be started"),
-        ],
-        2,
+        ]
     ),
 )
 def test_a_live_reconstruction_that_dies_touches_nothing(
@@ -128,7 +127,7 @@ def test_a_live_reconstruction_that_dies_touches_nothing(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
-@pytest.mark.parametrize("times", [1, 9])
+@pytest.mark.parametrize("times", others_slow([9, 1]))
 def test_one_that_is_killed_in_the_scan_is_started_again_but_not_for_ever(tmp_path: Path, times: int) -> None:
     code = f"""
 import json, os, pathlib, signal, sys

@@ -36,6 +36,7 @@ from recon.voxels.direct import Fbp
 from recon.voxels.methods import FistaTv
 from tests.beamline.ball_scan import COMMON, shipped, with_scene
 from tests.beamline.scans import seal
+from tests.slow_cases import others_slow
 
 # A can of 2.8 fields with a ball near its wall, which no ordinary view at 0 degrees shows.
 PIXEL, COLS, VIEWS = 4.6e-3, 40, 12
@@ -69,6 +70,12 @@ def motor(mm_per_deg: float, high: float = 25) -> str:
         f"devices.sample_mover={{kind: stage, in_deg: 1, out_deg: 12, mm_per_deg: {mm_per_deg}, speed_deg_s: 10, "
         f"stage: {stage}}}"
     )
+
+
+@pytest.fixture(scope="module")
+def wide_scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a scan with offset views, for tests that only read it."""
+    return run_scan(asked(*WIDE), tmp_path_factory.mktemp("runs"), []).path
 
 
 def asked(*words: str) -> Config:
@@ -165,11 +172,11 @@ def test_triggers_frames_and_rows_are_one(words: tuple[str, ...], tmp_path: Path
     assert [finding for finding in validate(scan.path) if finding.rule == "framestamps"] == []
 
 
-@pytest.mark.parametrize("words", [(), (motor(-1.0),)], ids=["simulated", "motor"])
-def test_the_sample_is_where_the_geometry_says(words: tuple[str, ...], tmp_path: Path) -> None:
+@pytest.mark.parametrize("moved_by", others_slow(["simulated", "motor"]))
+def test_the_sample_is_where_the_geometry_says(moved_by: str, wide_scan: Path, tmp_path: Path) -> None:
     """The ball's image in the frames of the simulator, beside the column that the shifts predict."""
-    scan = run_scan(asked(*WIDE, *words), tmp_path, [])
-    views, told = prepared(scan.path)
+    scan = wide_scan if moved_by == "simulated" else run_scan(asked(*WIDE, motor(-1.0)), tmp_path, []).path
+    views, told = prepared(scan)
     geometry, data = views.geometry, views.projections.data
     assert geometry.shifts[:, 0] == pytest.approx([0.0] * VIEWS + [COLS * step for step in np.repeat(STEPS, 2)])
     assert not geometry.shifts[:, 1].any()
@@ -184,14 +191,13 @@ def test_the_sample_is_where_the_geometry_says(words: tuple[str, ...], tmp_path:
     assert not any("beside the rotation axis" in sentence for sentence in told)  # as one that leaves on one side does
 
 
-def test_direct_methods_leave_them_out_and_others_get_them(tmp_path: Path) -> None:
-    views, _ = prepared(run_scan(asked(*WIDE), tmp_path, []).path)
+def test_direct_methods_leave_them_out_and_others_get_them(wide_scan: Path) -> None:
+    views, _ = prepared(wide_scan)
     assert [views_for(method, views)[1].n_views for method in (Fbp(), FistaTv())] == [VIEWS, VIEWS + 8]
 
 
-def test_stepped_views_of_another_program_come_by_poses(tmp_path: Path) -> None:
-    path = run_scan(asked(*WIDE), tmp_path, []).path
-    with h5py.File(path) as ours, h5py.File(tmp_path / "other.nxs", "w") as file:
+def test_stepped_views_of_another_program_come_by_poses(wide_scan: Path, tmp_path: Path) -> None:
+    with h5py.File(wide_scan) as ours, h5py.File(tmp_path / "other.nxs", "w") as file:
         for name in ("detector/data", "detector/image_key"):
             file[f"entry/instrument/{name}"] = ours[f"entry/instrument/{name}"][()]
         file["entry/sample/rotation_angle"] = ours["entry/sample/rotation_angle"][()]
@@ -208,13 +214,14 @@ def test_stepped_views_of_another_program_come_by_poses(tmp_path: Path) -> None:
     selection = Selection(axis_col=19.5).with_steps(PosesOfFile(read_poses(str(poses))))
     with open_scan(tmp_path / "other.nxs") as source:
         other = prepare_projections(source, selection, lambda sentence: None)
-    views, _ = prepared(path)
+    views, _ = prepared(wide_scan)
     assert other.geometry.shifts == pytest.approx(views.geometry.shifts)
     assert other.centred.geometry.n_views == VIEWS
     assert other.projections.data == pytest.approx(views.projections.data)
 
 
-@pytest.mark.parametrize("at", ["projection", "offset_view"])
+@pytest.mark.slow
+@pytest.mark.parametrize("at", ["offset_view", "projection"])
 def test_a_scan_that_is_resumed_has_them_and_its_copy_too(at: str, tmp_path: Path) -> None:
     stop = StopRequest()
 
@@ -237,9 +244,8 @@ def test_a_scan_that_is_resumed_has_them_and_its_copy_too(at: str, tmp_path: Pat
 
 
 def test_the_record_names_all_views_used_and_ordinary_ones_judge_the_volume(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    wide_scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = run_scan(asked(*WIDE), tmp_path, []).path
     judged: list[int] = []
 
     def noted(made: Reconstruction, views: PreparedProjections, *more: Any) -> Any:
@@ -250,7 +256,7 @@ def test_the_record_names_all_views_used_and_ordinary_ones_judge_the_volume(
     used = []
     for method in (Fbp(), FistaTv(iterations=2, tv_weight=0.01)):
         target = OutputPaths(tmp_path / f"{method.name}.h5", None)
-        options = ReconOptions(SourceOptions(path), target, Selection(axis_col=(COLS - 1) / 2), method=method)
+        options = ReconOptions(SourceOptions(wide_scan), target, Selection(axis_col=(COLS - 1) / 2), method=method)
         record = reconstruct_file(options, lambda event: None, SystemClock())
         used.append(len(np.atleast_1d(record.parameters["view_frames"])))
     assert (used, judged) == ([VIEWS, VIEWS + 8], [VIEWS, VIEWS])

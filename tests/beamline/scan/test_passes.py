@@ -38,6 +38,7 @@ from drivers.base.frame import Frame, FrameKind
 from tests.beamline.chosen import Scripted, choosing
 from tests.beamline.fakes import FakeInstrument, Faults, assert_true, decode
 from tests.beamline.ran import Ran, killed
+from tests.slow_cases import others_slow
 
 FIRST, VIEWS = 5, 12  # 3 darks and 2 flats before the views
 WIDE = 4  # at two angles on either side
@@ -77,9 +78,10 @@ def frames_of(path: Path) -> list[Frame]:
         return list(source.frames())
 
 
-@pytest.mark.parametrize("mode", MODES)
-@settings(max_examples=8, deadline=None)
+@pytest.mark.parametrize("mode", others_slow(MODES))
+@settings(max_examples=2, deadline=None)
 @given(script=st.lists(st.sampled_from([Choice.NEXT, Choice.NEXT, Choice.AGAIN, Choice.OFFSET, Choice.ENOUGH])))
+@example(script=[Choice.AGAIN, Choice.OFFSET, Choice.ENOUGH])
 def test_each_choice_is_taken_in_its_place(mode: str, script: list[Choice]) -> None:
     words, pass_views, sizes = MODES[mode]
     chooser = Scripted(script)
@@ -119,16 +121,11 @@ def test_the_passes_of_a_step_scan_change_no_plan_so_that_older_parts_of_a_run_h
     ran = Ran(tmp_path, FakeInstrument(), *MODES["step"][0])
     with open_scan(ran.result.path) as source:
         assert "pass_views" not in source.plan
-
-
-def test_without_a_chooser_nothing_is_in_the_file(tmp_path: Path) -> None:
-    ran = Ran(tmp_path, FakeInstrument())
     with h5py.File(ran.result.path) as file:
-        assert layout.PASS_ENDS not in file and layout.DECISIONS not in file
         assert (pass_ends_in(file).size, decisions_in(file)) == (0, ())
 
 
-@pytest.mark.parametrize("mode", ["fly", "step"])
+@pytest.mark.parametrize("mode", others_slow(["fly", "step"]))
 def test_views_are_taken_again_between_passes_within_the_budget(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -203,7 +200,7 @@ def test_a_stop_in_the_wide_views_of_one_place_does_not_move_the_sample_to_the_n
     assert wide == [VIEWS]
 
 
-@pytest.mark.parametrize("mode", ["fly", "step"])
+@pytest.mark.parametrize("mode", others_slow(["fly", "step"]))
 def test_the_wide_views_after_enough_pause_and_end_as_those_of_any_scan(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,10 +239,23 @@ def test_the_wide_views_after_enough_pause_and_end_as_those_of_any_scan(
 CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.OFFSET, Choice.ENOUGH]), max_size=4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["fly", "step"])
-@settings(max_examples=4, deadline=None, phases=[Phase.explicit, Phase.generate])
+@settings(max_examples=3, deadline=None, phases=[Phase.generate])
 @given(script=CHOICES, cuts=st.lists(st.integers(FIRST, FIRST + VIEWS + WIDE - 1), min_size=1, max_size=2))
-@example(script=[Choice.ENOUGH], cuts=[FIRST + 6])  # in the offset views
+def test_any_scan_that_is_killed_goes_on(mode: str, script: list[Choice], cuts: list[int]) -> None:
+    test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode, script, cuts)
+
+
+@pytest.mark.parametrize(
+    ("mode", "script", "cuts"),
+    others_slow(
+        [
+            ("fly", [Choice.ENOUGH], [FIRST + 6]),  # in the offset views
+            ("step", [Choice.AGAIN, Choice.OFFSET], [FIRST + 7, FIRST + 2]),
+        ]
+    ),
+)
 def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script: list[Choice], cuts: list[int]) -> None:
     words, pass_views, sizes = MODES[mode]
     chooser = Scripted(script)
@@ -280,6 +290,7 @@ def test_a_scan_that_is_killed_goes_on_within_what_was_chosen(mode: str, script:
         assert [finding for finding in validate(path, lambda done, of: None) if finding.severity == "error"] == []
 
 
+@pytest.mark.slow
 def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -298,11 +309,14 @@ def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
 
 @pytest.mark.parametrize(
     ("script", "cut", "missing", "words"),
-    [
-        ([Choice.ENOUGH], FIRST + 3, 0, "with 3 of 12 views; it had decided against the others."),  # in the last flats
-        ([Choice.AGAIN], FIRST + 9, 2, "with 10 of 12 views."),  # another pass of three was to be taken
-        ([Choice.AGAIN], FIRST + 4, 7, "with 5 of 12 views."),  # the first pass lacks a view of its second time
-    ],
+    others_slow(
+        [
+            ([Choice.ENOUGH], FIRST + 3, 0, "with 3 of 12 views; it had decided against the others."),  # in last flats
+            ([Choice.AGAIN], FIRST + 9, 2, "with 10 of 12 views."),  # another pass of three was to be taken
+            ([Choice.AGAIN], FIRST + 4, 7, "with 5 of 12 views."),  # the first pass lacks a view of its second time
+        ],
+        2,
+    ),
 )
 def test_views_that_the_scan_decided_against_are_not_missing(
     script: list[Choice], cut: int, missing: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -347,6 +361,7 @@ def stopped(stop: StopRequest, passes: Passes) -> None:
     stop.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["fly", "step"])
 def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -374,6 +389,7 @@ def test_a_choice_that_was_due_when_the_scan_ended_is_made_before_the_next_pass(
             ...
 
 
+@pytest.mark.slow
 def test_a_file_with_passes_taken_again_is_read_without_a_false_word(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -39,6 +39,7 @@ from drivers.base.frame import FrameKind
 from tests.beamline.fakes import FakeInstrument, Faults, assert_true
 from tests.beamline.prepared_views import evidence_of
 from tests.beamline.ran import Ran, ended_run, small
+from tests.slow_cases import others_slow
 
 FIRST = 5  # 3 darks and 2 flats
 VIEWS = 12
@@ -94,6 +95,7 @@ def _assert_told_of_parts(run: Path) -> None:
     assert (facts["missing_triggers"], facts["attributes"]["parts"]) == (0, "scan.h5, part-2/scan.h5")
 
 
+@pytest.mark.slow
 def test_the_views_of_all_parts_are_corrected_together(run: Path, tmp_path: Path) -> None:
     go_on(run)
     _assert_told_of_parts(run)
@@ -123,11 +125,13 @@ def _without_a_flat(runs: Path, *overrides: str, at: int) -> Path:
 
 @pytest.mark.parametrize(
     ("end", "taken", "overrides"),
-    [
-        (_without_a_flat, "FF", ()),
-        (_aborted, "FFDDD", ("scan.darks.at=both", "scan.mode=step")),
-        (_aborted, "FF", ("scan.flats.at=end",)),
-    ],
+    others_slow(
+        [
+            (_aborted, "FFDDD", ("scan.darks.at=both", "scan.mode=step")),
+            (_without_a_flat, "FF", ()),
+            (_aborted, "FF", ("scan.flats.at=end",)),
+        ]
+    ),
 )
 def test_references_of_the_end_alone_are_taken(
     tmp_path: Path, end: Callable[..., Path], taken: str, overrides: tuple[str, ...]

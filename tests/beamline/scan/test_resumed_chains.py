@@ -198,20 +198,21 @@ class PartsOfARun(RuleBasedStateMachine):
 
 
 @pytest.mark.timeout(1200)
-@pytest.mark.parametrize(("runs", "steps"), [(3, 4), pytest.param(9, 7, marks=[pytest.mark.slow, pytest.mark.long])])
+@pytest.mark.parametrize(("runs", "steps"), [(2, 4), pytest.param(9, 7, marks=[pytest.mark.slow, pytest.mark.long])])
 def test_any_order(runs: int, steps: int) -> None:
     drawn = settings(max_examples=runs, stateful_step_count=steps, deadline=None, phases=[Phase.generate])
     run_state_machine_as_test(PartsOfARun, settings=drawn)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "steps"),
     [
         ("step", [("killed", VIEW), ("killed", VIEW), ("stopped", START)]),
+        ("fly", [("lossy", FIRST + 2), ("full", DARKS), ("aborted", VIEW)]),
         ("fly", [("killed", DARKS), ("failed", VIEW), ("killed", DARKS)]),
         ("interlaced", [("stopped", VIEW), ("unjoined_whole", START)]),
         ("backwards", [("aborted", LAST), ("aborted", START), ("killed", 0)]),  # references of the end alone
-        ("fly", [("lossy", FIRST + 2), ("full", DARKS), ("aborted", VIEW)]),
     ],
 )
 def test_named_orders(mode: str, steps: list[tuple[str, int]]) -> None:

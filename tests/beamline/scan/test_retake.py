@@ -20,6 +20,7 @@ from beamline.storage.rules.evidence import ScanEvidence
 from drivers.base.frame import FrameKind
 from tests.beamline.fakes import COUNT, FakeInstrument, Faults, decode
 from tests.beamline.ran import Ran
+from tests.slow_cases import others_slow
 
 WORDS = ("monitor.retake=true", "monitor.retake_share=0.5", "scan.angles.views=16", "scan.settle_s=0")
 FIRST, N = 5, 16  # the first view's row; 3 darks and 2 flats before, 2 flats after
@@ -30,8 +31,8 @@ def retakes(ran: Ran) -> int:
     return sum(event.data["message"].startswith("Taking ") for event in ran.of("state"))
 
 
-@pytest.mark.parametrize("mode", ["fly", "step"])
-@settings(max_examples=4, deadline=None)
+@pytest.mark.parametrize("mode", others_slow(["fly", "step"]))
+@settings(max_examples=3, deadline=None)
 @given(repeats=st.sets(st.integers(FIRST + 1, FIRST + N - 1), min_size=1, max_size=14))
 def test_each_view_with_an_alarm_is_taken_again_at_its_angle(mode: str, repeats: set[int]) -> None:
     with TemporaryDirectory() as folder:
@@ -131,7 +132,7 @@ def test_a_frame_lost_again_costs_nothing(tmp_path: Path) -> None:
         assert source.table.kinds[8] == FrameKind.PROJECTION and source.table.kinds[10] == FrameKind.INVALID
 
 
-@pytest.mark.parametrize("mode", ["fly", "step"])
+@pytest.mark.parametrize("mode", others_slow(["fly", "step"]))
 def test_a_view_that_gave_no_frame_is_taken_again_under_its_trigger(tmp_path: Path, mode: str) -> None:
     """The view after it is good, and not taken again."""
     ran = Ran(tmp_path, FakeInstrument(Faults(lost={FIRST + 3})), *WORDS, f"scan.mode={mode}")

@@ -13,28 +13,20 @@ import pytest
 from beamline.config.load import resolved_yaml
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
-from beamline.core.stop import StopRequest
 from beamline.scan.control import State, running
 from beamline.scan.resume import NoFrame, open_for_resume, recover_run
 from beamline.scan.runs import describe, newest, runs_in
 from beamline.storage import writer_lock
 from beamline.storage.run_record import RecordFile, RunRecord, read_record, write_record
 from tests.beamline.fakes import FakeInstrument
-from tests.beamline.ran import Ran, small
+from tests.beamline.ran import Ran, ended_run, small
 
 FRAMES = 3 + 2 + 12 + 2  # darks, flats, views, flats of the configuration `small`
 
 
-def _run(runs: Path, at: int | None = None, *, abort: bool = True) -> Path:
-    """A run, whole or ended at its frame number `at`."""
-    stop = StopRequest()
-
-    def end(number: int) -> None:
-        if number == at:
-            (stop.abort if abort else stop.stop)()
-
-    ran = Ran(runs, FakeInstrument(on_frame=end), stop=stop)
-    return ran.folder
+def _run(runs: Path, at: int | None = None) -> Path:
+    """A run, whole or aborted at its frame number `at`."""
+    return Ran(runs, FakeInstrument()).folder if at is None else ended_run(runs, "aborted", at=at)
 
 
 def _part(folder: Path, record: RunRecord) -> Path:
@@ -105,11 +97,9 @@ def test_a_damaged_record_hides_no_run(tmp_path: Path, record: bytes) -> None:
     assert (found.sample, found.frames, found.state) == ("cell", None, "not known")
 
 
-@pytest.mark.parametrize(("at", "abort", "state"), [(None, False, "done"), (8, False, "stopped"), (8, True, "stopped")])
-def test_a_run_of_an_earlier_version_has_the_state_of_its_file(
-    tmp_path: Path, at: int | None, abort: bool, state: str
-) -> None:
-    run = _run(tmp_path, at, abort=abort)
+@pytest.mark.parametrize(("at", "state"), [(None, "done"), (8, "stopped")])
+def test_a_run_of_an_earlier_version_has_the_state_of_its_file(tmp_path: Path, at: int | None, state: str) -> None:
+    run = _run(tmp_path, at)
     now = describe(run)
     (run / "state.json").unlink()
     earlier = describe(run)

@@ -61,10 +61,8 @@ watchdog.main(Path(sys.argv[1]), int(sys.argv[2]), sys.stdin.buffer.raw)
 posix = pytest.mark.skipif(os.name != "posix", reason="a process of Windows gets no such requests")
 
 
-@pytest.mark.parametrize(
-    ("kind", "frozen"),
-    [("zaber", ""), *(pytest.param(*one, marks=pytest.mark.slow) for one in OTHERS)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "frozen"), [("zaber", ""), *OTHERS])
 def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
     tmp_path: Path, kind: str, frozen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -176,6 +174,7 @@ def children_with(word: str, parent: int | None = None) -> list[psutil.Process]:
     return [one for one in running if word in " ".join(one.cmdline())]
 
 
+@pytest.mark.slow
 @posix
 def test_requests_to_end_do_not_end_the_watchdog_of_a_scan_that_lives(tmp_path: Path) -> None:
     (tmp_path / CONFIG).write_text(resolved_yaml(load(config_folder() / "instrument.yaml", (), {})))

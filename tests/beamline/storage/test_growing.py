@@ -46,6 +46,7 @@ def write_and_wait(path: Path, written: Event) -> None:
     multiprocessing.get_context("spawn").Event().wait()
 
 
+@pytest.mark.slow
 def test_a_killed_writer_leaves_the_flushed_frames(tmp_path: Path) -> None:
     spawn = multiprocessing.get_context("spawn")
     written = spawn.Event()

@@ -83,6 +83,7 @@ def test_a_scan_that_died_can_be_resumed_or_recovered_and_its_file_alone_be_reco
         lock.release()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["stopped", "aborted"])
 def test_a_scan_that_ended_early_can_be_resumed_until_nothing_is_missing(tmp_path: Path, end: str) -> None:
     run = ended_run(tmp_path, end, at=AT)

@@ -134,6 +134,7 @@ except DataError as error:
 """
 
 
+@pytest.mark.slow
 def test_all_of_it_in_one_process(shim: Path, finished: Path, tmp_path: Path) -> None:
     known = os.environ | {"LD_PRELOAD": str(shim), "FLOCK_FAILS": "37"}
     words = [str(tmp_path), str(finished), str(config_folder() / "simulated.yaml")]

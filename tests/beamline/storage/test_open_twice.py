@@ -10,6 +10,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 
 from beamline import api
 from beamline.monitor.digest import digest
@@ -49,6 +50,7 @@ def other_program(path: Path) -> subprocess.Popen[str]:
     return process
 
 
+@pytest.mark.slow
 def test_followed_twice_and_looked_at_while_another_program_writes(tmp_path: Path) -> None:
     path = tmp_path / "scan.h5"
     with other_program(path) as process, open_scan(path, follow=True) as one, open_scan(path, follow=True) as two:

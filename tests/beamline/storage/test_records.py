@@ -15,7 +15,7 @@ from beamline.features.files.ingest import ingest
 from beamline.features.files.validate import describe, validate
 from beamline.projections.replay import replay
 from beamline.storage.readers.open import open_scan
-from beamline.storage.recorded_frames import frames_in
+from beamline.storage.recorded_frames import frames_in, record_checksums
 from beamline.storage.recover import recover
 from beamline.storage.writers import layout
 from drivers.base.frame import Frame, FrameKind
@@ -31,7 +31,17 @@ def _flip(path: Path, column: str, row: int, bit: int) -> None:
         file[column][...] = values
 
 
-@pytest.mark.parametrize("column", [*layout.RECORDED, layout.RECORD_CHECKSUM])
+def test_each_column_has_its_part_in_the_checksum_of_a_row(path: Path) -> None:
+    with h5py.File(path) as file:
+        columns = {column: file[column][()] for column in layout.RECORDED}
+    before = record_checksums(columns)
+    for column, values in columns.items():
+        bits = values.copy()
+        bits[ROW : ROW + 1].view(f"u{bits.itemsize}")[0] ^= np.array(1 << 8 * bits.itemsize - 3, f"u{bits.itemsize}")
+        assert np.flatnonzero(record_checksums(columns | {column: bits}) != before).tolist() == [ROW], column
+
+
+@pytest.mark.parametrize("column", [layout.ANGLE, layout.KIND, layout.RECORD_CHECKSUM])
 def test_one_flipped_bit_is_found_and_its_frame_is_left_out(path: Path, frames: list[Frame], column: str) -> None:
     _flip(path, column, ROW, 8 * np.dtype(layout.COLUMNS[column][0]).itemsize - 3)
     with open_scan(path) as source:

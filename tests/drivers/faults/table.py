@@ -107,15 +107,25 @@ LINE: tuple[LineFault, ...] = (
 )
 
 
-def phases_of(kind: str, phases: Sequence[Phase]) -> Sequence[Phase]:
-    """Those of the phases in which a fault is tried on a controller: on the first in each, the others share them."""
-    n = list(KINDS).index(kind)
-    return phases if n == 0 or len(phases) == 1 else phases[n - 1 :: len(KINDS) - 1]
+def phases_of(kind: str, phases: Sequence[Phase], fault: int = 0) -> Sequence[Phase]:
+    """Those of the phases in which a fault is tried on a controller: the controllers share them, and of a row of the
+    table another one begins than of the next."""
+    n = (list(KINDS).index(kind) + fault) % len(KINDS)
+    return phases[n :: len(KINDS)] or phases[-1:]
 
 
 def slow_but(kind: str) -> list[pytest.MarkDecorator]:
     """No mark for the first controller; the others are slow."""
     return [pytest.mark.slow] * (kind != next(iter(KINDS)))
+
+
+def one_each(rows: Sequence[Any]) -> list[Any]:
+    """For `parametrize`: each row with each controller, of which one is quick, another one for each row."""
+    return [
+        pytest.param(row, kind, id=f"{row.fault}-{kind}", marks=[pytest.mark.slow] * ((n - k) % len(KINDS) > 0))
+        for n, row in enumerate(rows)
+        for k, kind in enumerate(KINDS)
+    ]
 
 
 UNPLUGGED, PORT_FAILED = "stage unplugged", "the port failed"

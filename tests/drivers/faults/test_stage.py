@@ -18,14 +18,12 @@ from tests.drivers.faults.aftermath import (
     assert_reported_once,
     assert_speaks,
 )
-from tests.drivers.faults.rig import KINDS, VIEWS, Rig
-from tests.slow_cases import others_slow
+from tests.drivers.faults.rig import VIEWS, Rig
 
 RigOf = Callable[[str], Rig]
 
 
-@pytest.mark.parametrize("kind", others_slow(KINDS))
-@pytest.mark.parametrize("row", table.MOTION, ids=lambda row: row.fault)
+@pytest.mark.parametrize(("row", "kind"), table.one_each(table.MOTION))
 def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: str, tmp_path: Path) -> None:
     """The views before it are in the file; no view is called missing, for it was never reached."""
     rig = rig_of(kind)
@@ -42,8 +40,7 @@ def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: s
     assert_next_scan_works(rig, tmp_path, row.flags.get(kind, ""))
 
 
-@pytest.mark.parametrize("kind", others_slow(KINDS))
-@pytest.mark.parametrize("row", table.MOTION[:2], ids=lambda row: row.fault)
+@pytest.mark.parametrize(("row", "kind"), table.one_each(table.MOTION[:2]))
 def test_a_stage_that_stops_early_in_a_step_scan(
     rig_of: RigOf, row: table.MotionFault, kind: str, tmp_path: Path
 ) -> None:
@@ -59,8 +56,7 @@ def test_a_stage_that_stops_early_in_a_step_scan(
     assert_kept(scanned, list(range(6)))
 
 
-@pytest.mark.parametrize("kind", others_slow(KINDS))
-@pytest.mark.parametrize("row", table.PULSES, ids=lambda row: row.fault)
+@pytest.mark.parametrize(("row", "kind"), table.one_each(table.PULSES))
 def test_a_trigger_cable_that_loses_or_picks_up_pulses(
     rig_of: RigOf, row: table.PulseFault, kind: str, tmp_path: Path
 ) -> None:

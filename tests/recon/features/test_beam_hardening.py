@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.features.beam_hardening import Curve, NoCurveError, curve_of_paths, curve_of_spectrum
@@ -19,7 +19,6 @@ def _seen(spectrum: list[tuple[float, float]], depth: np.ndarray) -> np.ndarray:
     return BeamHardening(weights, energies=energies).apply(depth[None].copy(), shots.shot())[0]
 
 
-@settings(max_examples=20)
 @given(ENERGIES)
 def test_the_spectrum_that_hardened_gives_the_depth_back(spectrum: list[tuple[float, float]]) -> None:
     depth = np.linspace(0, 5, 50)

@@ -132,7 +132,7 @@ def of_all_but_one(clean: F32) -> F32:
         return fitted(without, steps=60, finish=0).volume.data
 
 
-@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 1e9, 3e3]))
+@pytest.mark.parametrize("value", others_slow([1e30, 300.0, -1e30, 3e3]))
 def test_one_wild_pixel_changes_a_fit_little(clean: F32, truth: F32, of_all_but_one: F32, value: float) -> None:
     # It may have no part in where the first Gaussians are placed, nor in how dense they are.
     wild = clean.copy()
@@ -174,6 +174,7 @@ def test_equal_angles_count_as_one_place(clean: F32, truth: F32) -> None:
     assert psnr(truth, fitted(data, geometry).volume.data) > 27
 
 
+@pytest.mark.slow
 @given(st.permutations(range(32)), st.lists(st.integers(-40, 40), min_size=32, max_size=32))
 @settings(max_examples=10)
 def test_order_and_whole_turns_of_the_angles_do_not_matter(order: list[int], turns: list[int]) -> None:
@@ -197,6 +198,7 @@ def test_detectors_of_one_row_or_one_column(shape: tuple[int, int]) -> None:
         assert psnr(SPHERES.volume(grid), fitted(data, views).volume.data) > 25
 
 
+@pytest.mark.slow
 def test_a_fit_smooths_voxels_of_any_edges(clean: F32) -> None:
     flat = Grid((3, 48, 48), 1.0, slice_pitch=4.0)
     problem = fit.problem_of(Views(clean, VIEWS), flat, 0.05, SHORT)

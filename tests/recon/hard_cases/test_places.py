@@ -13,7 +13,7 @@ import numba
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
@@ -193,7 +193,6 @@ def test_nothing_at_all_is_zeros() -> None:
 places = st.tuples(st.floats(-60, 110), st.floats(-50, 50), st.floats(-60, 90))
 
 
-@settings(max_examples=60)
 @given(
     spots=st.lists(st.tuples(places, st.floats(-2, 1.5), st.floats(-6, 6)), min_size=1, max_size=6),
     seed=st.integers(0, 100),

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.base.geometry import Geometry
@@ -175,7 +175,6 @@ exponents = st.floats(-4, 4)
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
 @given(
     shape=st.tuples(exponents, exponents, exponents),
     turn=st.tuples(*(st.floats(-1, 1),) * 4).filter(lambda q: sum(x * x for x in q) > 1e-6),

@@ -6,13 +6,12 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.post import clusters, elbow, k_means
 
 
-@settings(max_examples=25)
 @given(st.lists(st.floats(-100, 100), min_size=6, max_size=14, unique=True), st.integers(2, 3))
 def test_centres_are_nearly_the_best_of_all_partitions(values: list[float], k: int) -> None:
     ordered = np.sort(values)

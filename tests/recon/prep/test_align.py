@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -182,7 +182,6 @@ def scan() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @given(seed=st.integers(0, 2**32 - 1), shift=st.integers(-15, 15), start=st.floats(-10, 10), mirrored=st.booleans())
-@settings(max_examples=20, deadline=None)
 def test_order_start_sense_and_place_do_not_matter(
     scan: tuple[NDArray[np.float64], NDArray[np.float64]], seed: int, shift: int, start: float, mirrored: bool
 ) -> None:

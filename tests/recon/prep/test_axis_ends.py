@@ -37,8 +37,7 @@ def half_turn(n: int) -> NDArray[np.float64]:
     return np.pi * np.arange(n) / n
 
 
-@pytest.mark.parametrize("over", [1.5, 3.0])
-@pytest.mark.parametrize("axis_col", others_slow([47.5, 51.2, 44.13]))
+@pytest.mark.parametrize(("over", "axis_col"), others_slow([(1.5, 47.5), (3.0, 51.2), (1.5, 44.13)], 2))
 def test_the_axis_of_half_a_turn_of_a_wider_sample(over: float, axis_col: float) -> None:
     """The wedge, which needs the whole sample in the field, is not sure, and columns off."""
     views = grains(5, over, half_turn(120), axis_col)

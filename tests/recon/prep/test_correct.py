@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -43,7 +43,6 @@ def positions(counts: NDArray[np.generic]) -> NDArray[np.float64]:
 
 
 @given(seed=st.integers(0, 2**32 - 1), views=st.integers(1, 4), rows=st.integers(1, 5), cols=st.integers(1, 9))
-@settings(max_examples=40, deadline=None)
 def test_beer_lambert_round_trips(seed: int, views: int, rows: int, cols: int) -> None:
     rng = np.random.default_rng(seed)
     truth = rng.uniform(0, 6, (views, rows, cols))
@@ -71,7 +70,6 @@ def test_an_ordinary_sample_round_trips_with_everything_on(rng: np.random.Genera
     low=st.integers(-500, 0),
     kind=st.sampled_from([np.uint16, np.int32, np.float32, np.float64]),
 )
-@settings(max_examples=40, deadline=None)
 def test_counts_of_zero_and_below_stand_at_the_floor(seed: int, low: int, kind: type) -> None:
     rng = np.random.default_rng(seed)
     counts, references = beer_lambert(sphere(3, 6, 40), rng)
@@ -86,7 +84,6 @@ def test_counts_of_zero_and_below_stand_at_the_floor(seed: int, low: int, kind: 
 
 
 @given(seed=st.integers(0, 2**32 - 1), scale=st.floats(1e-3, 1e3))
-@settings(max_examples=25, deadline=None)
 def test_the_unit_of_the_counts_does_not_matter(seed: int, scale: float) -> None:
     rng = np.random.default_rng(seed)
     counts, references = beer_lambert(sphere(), rng, noise=0.01)
@@ -106,7 +103,6 @@ def test_the_unit_of_the_counts_does_not_matter(seed: int, scale: float) -> None
 
 
 @given(seed=st.integers(0, 2**32 - 1), value=st.sampled_from([np.nan, np.inf, -np.inf]))
-@settings(max_examples=25, deadline=None)
 def test_what_is_not_finite_is_filled_and_does_not_spread(seed: int, value: float) -> None:
     rng = np.random.default_rng(seed)
     truth = sphere()
@@ -307,7 +303,6 @@ def in_batches(
     cuts=st.sets(st.integers(1, 8)),
     air=st.sampled_from(["auto", "none", (4, 3)]),
 )
-@settings(max_examples=40, deadline=None)
 def test_batches_of_any_size_are_the_views_at_once_to_the_bit(
     seed: int, views: int, cuts: set[int], air: object
 ) -> None:

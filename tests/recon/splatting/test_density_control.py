@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.base.volume import Grid
@@ -32,7 +32,6 @@ def _masses(log_scales: np.ndarray, raw: np.ndarray) -> np.ndarray:
     return np.logaddexp(0, raw.astype(np.float64)) * np.exp(log_scales.astype(np.float64).sum(1))
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 1000))
 def test_growing_conserves_mass_and_centre_of_mass(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -65,7 +64,6 @@ def test_pruning_takes_the_faint_and_the_lost() -> None:
     assert change.parents.size == 0
 
 
-@settings(max_examples=30)
 @given(seed=st.integers(0, 1000), wide=st.floats(0.05, 5))
 def test_removed_gaussians_hardly_reach_into_the_box_and_others_stay(seed: int, wide: float) -> None:
     rng = np.random.default_rng(seed)
@@ -110,7 +108,6 @@ def test_the_limit_keeps_the_most_wanted(random_gaussians: Make) -> None:
     assert change.means.shape[0] == 23
 
 
-@settings(max_examples=30)
 @given(seed=st.integers(0, 1000), faint=st.integers(0, 12))
 def test_at_the_limit_pruning_and_splitting_relocate_at_a_constant_number(seed: int, faint: int) -> None:
     rng = np.random.default_rng(seed)

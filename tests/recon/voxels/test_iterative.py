@@ -275,7 +275,8 @@ def test_progress_stop_and_start(method: Any) -> None:
     np.testing.assert_array_equal(three.data, before)
 
 
-@pytest.mark.parametrize("weighed", [False, True])
+@pytest.mark.slow
+@pytest.mark.parametrize("weighed", [True, False])
 def test_asd_pocs_without_a_goal_takes_one_from_the_direct_method(weighed: bool, rng: np.random.Generator) -> None:
     projector, _, views = parallel_case(n_views=20)
     given, weight, root = views, None, np.ones(views.shape)
@@ -326,7 +327,7 @@ def test_misuse_is_named() -> None:
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
     ("weight", "pitch"),
-    others_slow([(1e-40, 1.0), (3e38, 1.0), (1e20, 1e-12), (1e-20, 1.0), (1e20, 1.0), (1.0, 1e8), (1.0, 1e-12)], 3),
+    others_slow([(1e-40, 1.0), (1e20, 1e-12), (3e38, 1.0), (1.0, 1e8)], 2),
 )
 def test_units_do_not_matter(method: Any, weight: float, pitch: float) -> None:
     """Lengths, weights: only their ratios count, however far float32's squares would be out of range."""
@@ -345,8 +346,10 @@ def test_a_box_that_no_ray_meets_stays_empty(method: Any) -> None:
     assert not solve(replace(method, iterations=2), aside, views).data.any()
 
 
-@pytest.mark.parametrize("method", [FistaTv(iterations=6), OsSirtTv(iterations=8)])
-@pytest.mark.parametrize("n_views", [10, 24])  # by the noise, and by views held out
+@pytest.mark.parametrize(
+    ("method", "n_views"),  # by the noise, and by views held out
+    others_slow([(OsSirtTv(iterations=8), 10), (FistaTv(iterations=6), 24)]),
+)
 def test_the_weight_that_was_chosen_is_recorded_and_gives_the_same_volume(method: Any, n_views: int) -> None:
     projector, _, views = parallel_case(n_views, 0.02, matched=True)
     chosen = reconstruct(views, projector.geometry, method, grid=projector.grid)

@@ -16,7 +16,6 @@ from recon.voxels.iterative import solve
 from recon.voxels.methods import FistaTv, OsSirtTv
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import Projector
-from tests.slow_cases import others_slow
 
 F32 = NDArray[np.float32]
 VIEWS = Geometry.parallel(np.linspace(0, np.pi, 48, endpoint=False), (12, 64))
@@ -105,8 +104,7 @@ def test_nothing_is_changed_by_a_residual_that_says_nothing() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sigma", [0.02, 0.08])
-@pytest.mark.parametrize("method", [FistaTv(), OsSirtTv()], ids=["fista-tv", "os-sirt-tv"])
+@pytest.mark.parametrize(("method", "sigma"), [(FistaTv(), 0.02), (OsSirtTv(), 0.08)], ids=["fista-tv", "os-sirt-tv"])
 def test_its_volume_is_near_that_of_the_best_weight(method: FistaTv | OsSirtTv, sigma: float) -> None:
     (truth, clean), projector = _grains(), Projector(VIEWS, GRID)
     data = clean + np.random.default_rng(1).normal(0, sigma, clean.shape).astype(np.float32)
@@ -122,7 +120,8 @@ def test_without_noise_there_is_next_to_no_total_variation() -> None:
     assert found > free - 0.5
 
 
-@pytest.mark.parametrize("method", others_slow([FistaTv(), OsSirtTv()]), ids=["fista-tv", "os-sirt-tv"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [FistaTv(), OsSirtTv()], ids=["fista-tv", "os-sirt-tv"])
 def test_faint_matter_beside_metal_has_no_checkerboard(method: FistaTv | OsSirtTv) -> None:
     """A weight in units of the metal (tv_weight=0.004) leaves one of a quarter of the faint density."""
     z, y, x = np.meshgrid(*GRID.coordinates(), indexing="ij")

@@ -9,7 +9,7 @@ from functools import cache, partial
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import sparse
@@ -69,7 +69,6 @@ def cases(draw: st.DrawFn) -> tuple[Geometry, Grid, int]:
 
 
 @given(cases())
-@settings(max_examples=60)
 def test_both_directions_are_the_explicit_matrix(case: tuple[Geometry, Grid, int]) -> None:
     _assert_the_matrix(*case, lambda matrix: 1.6e-4 * abs(matrix).sum() / max(1, matrix.nnz))
 
@@ -91,7 +90,6 @@ def _assert_the_matrix(geometry: Geometry, grid: Grid, seed: int, room: Callable
 
 
 @given(cases())
-@settings(max_examples=60)
 def test_the_transpose_is_exact(case: tuple[Geometry, Grid, int]) -> None:
     """To the rounding of float32 sums, and of the coordinates of a ray that grazes a voxel."""
     geometry, grid, seed = case
@@ -114,7 +112,6 @@ def slices(draw: st.DrawFn) -> tuple[Geometry, Grid, int]:
 
 
 @given(slices())
-@settings(max_examples=60)
 def test_a_single_slice_is_the_explicit_matrix_in_both_directions(case: tuple[Geometry, Grid, int]) -> None:
     _assert_the_matrix(*case, lambda matrix: 4e-5 * (abs(matrix).max() if matrix.nnz else 1.0))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
@@ -111,7 +111,6 @@ def test_weights_cover_the_measured_angle(angles: list[float]) -> None:
 
 
 @given(st.integers(2, 60), st.floats(-7, 7), st.integers(0, 2**31))
-@settings(max_examples=30)
 def test_equal_steps_in_any_order_weigh_the_same(n: int, start: float, seed: int) -> None:
     angles = start + half_turn(n) + np.pi * np.random.default_rng(seed).integers(-2, 3, n)
     np.testing.assert_allclose(angular_weights(angles), np.pi / n, rtol=1e-9)
@@ -152,7 +151,6 @@ def test_weights_of_no_angle_are_refused(angles: list[float]) -> None:
 
 
 @given(st.integers(8, 200), st.floats(-7, 7), st.integers(0, 2**31))
-@settings(max_examples=30)
 def test_equal_steps_of_a_circle_weigh_the_same(n: int, start: float, seed: int) -> None:
     angles = start + np.random.default_rng(seed).permutation(full_turn(n))
     np.testing.assert_allclose(circle_weights(angles), 2 * np.pi / n, rtol=1e-9)

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.special import j0
@@ -71,7 +71,6 @@ def test_waves_are_weakened_by_the_transfer(transfer: Transfer, width: float, sm
         assert amplitude == pytest.approx(float(transfer(np.array((omega * width) ** 2))), abs=0.2 / small**2)
 
 
-@settings(max_examples=40)
 @given(
     shape=st.tuples(st.integers(1, 40), st.integers(1, 40)),
     scale=st.sampled_from([1, 2, 4]),

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
@@ -116,7 +116,6 @@ def test_the_pattern_is_normal_and_neighbours_are_independent() -> None:
     np.testing.assert_array_equal(n, normals("prnu", 1, shots.sized(600, 700, frame=9, seed=9)))
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 500), st.integers(0, 1000), st.integers(1, 12), st.integers(1, 12))
 def test_a_region_sees_its_part(row: int, col: int, rows: int, cols: int) -> None:
     region = normals("prnu", 1, shots.shot(roi=(4 * row, 4 * col, 4 * rows, 4 * cols)))

@@ -64,11 +64,11 @@ def test_a_bent_beam_is_taken_off_and_weak_matter_stays() -> None:
     "bodies",
     [
         pytest.param((DOME, POST), id="clean"),
-        pytest.param((DOME, POST, Cylinder(29.0, 60.0, WEAK / 2)), id="weak matter all around"),
+        pytest.param((DOME, POST, Cylinder(29.0, 60.0, WEAK / 2)), id="weak matter all around", marks=pytest.mark.slow),
         pytest.param((POST, Cylinder(29.0, 60.0, WEAK / 10)), id="matter too weak to be seen"),
         pytest.param((DOME, POST, Cylinder(60.0, 60.0, WEAK)), id="wider than the field"),
         pytest.param((Cylinder(31.5, 60.0, 0.02),), id="no air"),
-        pytest.param((), id="nothing but air"),
+        pytest.param((), id="nothing but air", marks=pytest.mark.slow),
     ],
 )
 def test_nothing_is_taken_off_beams_that_are_their_flats(bodies: tuple[Cylinder | Ellipsoid, ...]) -> None:

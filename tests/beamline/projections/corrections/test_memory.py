@@ -85,10 +85,9 @@ def test_a_step_takes_no_more_memory_than_it_states_and_the_budget_has_it(step: 
     assert needs(path, Phase(None)).steps.correcting == 0
 
 
-@pytest.mark.parametrize("shape", [(60, 12, 96), pytest.param((90, 20, 112), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("step", ON_ALL.values(), ids=ON_ALL)
-def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep, shape: tuple[int, int, int]) -> None:
-    n, rows, cols = shape
+def test_a_step_on_all_views_takes_no_more_than_it_states(step: ScanStep) -> None:
+    shape = n, rows, cols = 60, 12, 96
     angles, x = np.linspace(0, np.pi, n, endpoint=False), np.linspace(-1, 1, cols)
     disc = 2 * np.sqrt(np.clip(0.36 - x**2, 0, None)) - 0.1 + 0.03 * x
     rng = np.random.default_rng(0)

@@ -15,23 +15,27 @@ from beamline.storage.readers.open import open_scan
 from beamline.storage.rules.evidence import EvidenceRequest, ScanEvidence
 from beamline.storage.rules.flag_policy import frames_flagged
 from tests.beamline.scans import TwoCylinders, frames_of, write_flagged
+from tests.slow_cases import others_slow
 
 FRAMES = frames_of(TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0))))  # 2 darks, 2 flats, 18 views
 
 
 @pytest.mark.parametrize(
     ("alarms", "severity", "said"),
-    [
-        (range(0), "info", "flagged 1 of 22 frames: beam 1 warn."),
-        (
-            range(6, 9),
-            "warning",
-            "flagged 4 of 22 frames: beam 1 warn 3 alarm. Frames with an alarm: 6-8. A reconstruction (--flags "
-            "use): Of 18 views 3 have an alarm and are left out (beam 3 alarm)",
-        ),
-        (range(6, 20), "error", "Frames with an alarm: 6-19. 4 of 18 views are left, 10 are needed"),
-        (range(2), "warning", "Frames with an alarm: 0-1."),
-    ],
+    others_slow(
+        [
+            (
+                range(6, 9),
+                "warning",
+                "flagged 4 of 22 frames: beam 1 warn 3 alarm. Frames with an alarm: 6-8. A reconstruction (--flags "
+                "use): Of 18 views 3 have an alarm and are left out (beam 3 alarm)",
+            ),
+            (range(6, 20), "error", "Frames with an alarm: 6-19. 4 of 18 views are left, 10 are needed"),
+            (range(0), "info", "flagged 1 of 22 frames: beam 1 warn."),
+            (range(2), "warning", "Frames with an alarm: 0-1."),
+        ],
+        2,
+    ),
 )
 def test_flags_are_counted_by_check_and_level(tmp_path: Path, alarms: range, severity: str, said: str) -> None:
     path = write_flagged(tmp_path / "s.h5", FRAMES, {**dict.fromkeys(alarms, Level.ALARM), 5: Level.WARN})

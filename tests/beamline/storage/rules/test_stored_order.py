@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -67,7 +67,6 @@ def _lopsided(views: int, rows: int, cols: int) -> np.ndarray:
     return (np.exp(-((u / 0.2) ** 2)) * (1.2 + height)).astype(np.float64)
 
 
-@settings(deadline=None, max_examples=30)
 @given(rows=st.integers(12, 60), cols=st.integers(24, 90), noise=st.floats(0, 0.1), drift=st.floats(0, 0.2))
 def test_a_horizontal_axis_is_told_and_a_vertical_one_never(rows: int, cols: int, noise: float, drift: float) -> None:
     rng = np.random.default_rng(rows)

@@ -11,7 +11,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.features.files.validate import describe, source_findings, validate
@@ -210,7 +210,6 @@ def test_opposite_views_of_a_few_are_one_direction(tmp_path: Path, views: int, t
     assert [said in hit.message for hit in angles_told(SourceOptions(path))] == [True] * bool(said)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     views=st.integers(6, 400),
     turns=st.sampled_from([0.25, 0.5, 1.0, 2.0, 20.0]),

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -62,7 +62,6 @@ def backward(rays: CpuRays, weights: F32) -> tuple[Gradients, F32]:
     return into, centres
 
 
-@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), cut=st.floats(1.0, 4.0), largest=st.sampled_from([0.5, 2.0, 6.0]))
 def test_a_ray_sees_a_gaussian_up_to_the_cut_and_not_beyond(seed: int, cut: float, largest: float) -> None:
     # The rays within `cut` standard deviations: the kernel lacks only what the reference has beyond them, and adds
@@ -85,7 +84,6 @@ def test_a_ray_sees_a_gaussian_up_to_the_cut_and_not_beyond(seed: int, cut: floa
         assert (whole[seen] >= thinnest * math.exp(-(cut**2) / 2) * 0.999 - 1e-6).all()
 
 
-@settings(max_examples=60)
 @given(
     size=st.floats(-4, 2),
     aspect=st.floats(0, 4),

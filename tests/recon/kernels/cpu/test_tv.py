@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from recon.kernels.cpu import tv as tv_cpu
@@ -17,7 +17,6 @@ in_pieces = st.sampled_from([(2, 3, 530), (3, 40, 16), (2, 15, 41), (2, 600, 1)]
 
 
 @given(shapes | in_pieces, st.booleans(), st.sampled_from(((0, 0), (1, 0), (0, 1), (1, 1))), st.integers(0, 2**31))
-@settings(max_examples=60)
 def test_dual_steps_are_the_reference_s(
     shape: tuple[int, int, int], nonnegative: bool, back: tuple[int, int], seed: int
 ) -> None:
@@ -60,7 +59,6 @@ def test_threads_share_planes_without_a_race(back: tuple[int, int], rng: np.rand
 
 
 @given(shapes, st.integers(0, 2**31))
-@settings(max_examples=30)
 def test_the_gradient_is_the_slope_of_tv(shape: tuple[int, int, int], seed: int) -> None:
     rng = np.random.default_rng(seed)
     x, smoothing = rng.normal(size=shape).astype(np.float32), 0.1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import correlate1d
 from scipy.optimize import nnls
@@ -24,7 +24,6 @@ def test_the_last_two_axes_change_places(shape: tuple[int, int, int], rng: np.ra
 
 
 @given(st.integers(1, 6), st.integers(1, 7), st.floats(-4, 4), st.floats(0.3, 2.5), st.integers(0, 2**31))
-@settings(max_examples=40)
 def test_rows_are_interpolated_and_the_transpose_is_exact(
     nz: int, n: int, first: float, step: float, seed: int
 ) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
@@ -66,7 +66,6 @@ def test_at_a_short_distance_it_is_the_transport_of_intensity(number: float, rng
     assert np.abs(first).max() > 10 * (second + 1e-5)
 
 
-@settings(max_examples=20)
 @given(
     rows=st.integers(8, 40),
     cols=st.integers(8, 40),

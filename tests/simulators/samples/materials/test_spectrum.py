@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
@@ -97,7 +97,6 @@ def test_light_that_is_not_there_is_refused() -> None:
         light(Beam(1.0, tube=Tube(60.0, {"it": 1e6})), [_smooth], 1.0, lambda name: _smooth)
 
 
-@settings(max_examples=30, deadline=None)
 @given(n=st.integers(5, 80), n_materials=st.integers(1, 3), seed=st.integers(0, 10**6), power=st.floats(1.0, 4.0))
 @example(n=53, n_materials=2, seed=15296, power=2.3125)  # an edge in each, and ways between them
 def test_light_through_any_ray_stays_the_same(n: int, n_materials: int, seed: int, power: float) -> None:

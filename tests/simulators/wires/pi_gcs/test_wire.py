@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.testing.stages.bench import EmittedPulse, emitted
@@ -162,7 +162,6 @@ def test_where_low_is_active_the_line_rises_when_a_pulse_ends() -> None:
     assert wire.places() == [5.01, 6.01, 7.01]
 
 
-@settings(max_examples=60)
 @given(way=st.lists(st.integers(-9000, 9000), min_size=1, max_size=6), step=st.integers(50, 3000))
 def test_without_a_window_pulses_are_a_step_apart_and_as_many_as_the_way_has(way: list[int], step: int) -> None:
     """Independent: walk the way count by count and fire whenever the last pulse is a step away."""

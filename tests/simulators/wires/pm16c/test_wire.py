@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from simulators.wires.pm16c.box import ms_per_1000_pps
@@ -123,7 +123,6 @@ def test_a_stop_at_the_instant_of_a_pulse_neither_loses_nor_repeats_one() -> Non
         assert wire.places() == list(range(10_000, 20_001, 1000))
 
 
-@settings(max_examples=50)
 @given(
     start=st.integers(1, 3000), interval=st.integers(1, 700), n=st.integers(1, 40), room=st.integers(0, 699),
     sign=st.sampled_from([-1, 1]), stop_after=st.floats(0.0, 8.0)
