@@ -23,7 +23,6 @@ from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import RegionOfRows
 from beamline.reconstruct.run import (
-    candidate_named,
     deviation_by_slabs,
     deviation_of,
     in_budget,
@@ -237,7 +236,8 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
         job.channels.warn("There are no error bars, because the reconstruction was stopped.")
         return made
     job.say("The volume is there; its error bars follow. Ctrl-C leaves them out.", "error_bars")
-    method = candidate_named(job.options.method_for(job.prepared.geometry), made.method)
+    method = job.options.method_for(job.prepared.geometry)
+    method = {each.name: each for each in method.alternatives}.get(made.method, method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
     given = made.volume, method, job.prepared, job.options
 

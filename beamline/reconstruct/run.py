@@ -164,11 +164,6 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
         )
 
 
-def candidate_named(method: Method, name: str) -> Method:
-    """The candidate of this name among which the method chose; the method itself if it chose among none."""
-    return {candidate.name: candidate for candidate in method.alternatives}.get(name, method)
-
-
 def deviation_of(
     volume: Volume, method: Method, prepared: PreparedProjections, options: ReconOptions, decided: Made,
     control: RunControl,
