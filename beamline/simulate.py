@@ -82,7 +82,4 @@ def volumes_beside(folder: Path) -> ReadVolume:
     """A reader of the volumes that a scene in `folder` names, by full or relative paths. It raises DataError."""
     from simulators.samples.sample import Stored
 
-    def read_beside(file: str, dataset: str | None) -> Stored:
-        return Stored(*whole_volume(folder / file, dataset))  # a full path stays itself
-
-    return read_beside
+    return lambda file, dataset: Stored(*whole_volume(folder / file, dataset))  # a full path stays itself

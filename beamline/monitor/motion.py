@@ -91,7 +91,7 @@ class Shake:
 
 
 SIGMAS = 8.0
-CELLS = 0.02  # share of a cell: least limit of a shake
+LEAST_SHAKE = 0.02  # of a cell: smaller ones are not reported on large frames, of which a cell has many pixels
 GONE, GROWN = 0.5, 2.0  # of its limit, below which a shake has gone; times the reported one, above which it is again
 CONFIRMED = 0.5  # of a figure; if less of it differs from row to row, this part counts: a ghost is as high as the frame
 
@@ -151,7 +151,7 @@ class MotionCheck(Logged):
     def _shake(self, state: MotionState, row: int, context: ScanContext) -> CheckResult[MotionState]:
         assert context.grid is not None
         across, down = context.shake
-        size, limit = math.hypot(across, down), max(self.shake, CELLS * context.grid.cell)
+        size, limit = math.hypot(across, down), max(self.shake, LEAST_SHAKE * context.grid.cell)
         if state.told and size < GONE * limit:
             return CheckResult(replace(state, told=0.0))
         if size <= max(limit, GROWN * state.told):

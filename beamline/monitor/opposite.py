@@ -26,7 +26,9 @@ MOST = 36  # of them: half a turn
 BESIDE = 1.01  # steps from the angle sought to a view, at most; a hundredth is rounding
 REACH = 2.0  # cells that the rim may move within these: the kept view goes on by its velocity
 LATER = 8  # views after the kept one at least
-CELLS = (0.05, 0.5, 0.25)  # shares of a cell: least limits of a shift, of a remainder and of the axis
+LEAST_SHIFT, LEAST_REMAINDER, LEAST_AXIS = 0.05, 0.5, 0.25
+"""Of a cell: the limits on large frames, where a cell is many pixels wide. With them one clean scan (the 44th, by its
+remainder) and no measured one is reported in tests/beamline/findings.json."""
 SIGMAS = 8.0  # standard deviations of the noise that a shift must have
 SHAKEN = 5.0  # standard deviations of the places of single views, where the sample shakes
 FEWEST = 16  # columns that can be laid on others
@@ -160,11 +162,11 @@ class OppositeCheck(Logged):
         if (
             fit is None
             or fit.remainder > smooth
-            or max(abs(fit.down), abs(fit.across) - rim) > max(self.warn, CELLS[0] * grid.cell, SIGMAS * fit.sigma)
+            or max(abs(fit.down), abs(fit.across) - rim) > max(self.warn, LEAST_SHIFT * grid.cell, SIGMAS * fit.sigma)
         ):
             return math.inf
         unsure = math.sqrt(1.5) * abs(steps * (steps - 1)) / 2 / smooth * fit.remainder**2
-        return unsure * (unsure > max(self.changed, CELLS[1] * grid.cell))
+        return unsure * (unsure > max(self.changed, LEAST_REMAINDER * grid.cell))
 
     def _mirrored(
         self, state: OppositeState, one: Kept, fit: ViewFit, view: CellView, context: ScanContext
@@ -179,7 +181,7 @@ class OppositeCheck(Logged):
         state = state if fit.unsure else replace(state, axis=usual)
         stated = context.axis_col
         shaken = SHAKEN * math.sqrt(fit.places) * context.shake[0] / 2
-        limit = max(self.axis, CELLS[2] * cell, shaken)
+        limit = max(self.axis, LEAST_AXIS * cell, shaken)
         if fit.unsure or flag is not None or not first or stated is None or abs(axis - stated) <= limit:
             return CheckResult(state, flag)
         advice = (
@@ -194,8 +196,8 @@ class OppositeCheck(Logged):
         moved, cell = math.hypot(fit.across, fit.down), context.grid.cell
         # The first pair, which gave the axis, had views beside the sample's way, too.
         shaken = SHAKEN * math.sqrt(2 * fit.places) * math.hypot(*context.shake)
-        moves = self.warn, CELLS[0] * cell, SIGMAS * fit.sigma, shaken
-        limits = max(fit.unsure, *moves), max(fit.unsure, self.changed, CELLS[1] * cell)
+        moves = self.warn, LEAST_SHIFT * cell, SIGMAS * fit.sigma, shaken
+        limits = max(fit.unsure, *moves), max(fit.unsure, self.changed, LEAST_REMAINDER * cell)
         if moved <= limits[0] and fit.remainder <= limits[1]:
             return None
         score, limit = (moved, limits[0]) if moved > limits[0] else (fit.remainder, limits[1])

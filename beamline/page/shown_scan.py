@@ -29,7 +29,7 @@ F32 = NDArray[np.float32]
 _REFERENCES = 8  # darks and flats that are averaged
 _VIEWS, _FAST_VIEWS = 360, 120  # of the slice; while a slider moves
 _MOST, _FAST_MOST = 768, 256  # voxels of the slice along a side
-_NEAR = 1 / 8  # of the columns, from the detector's middle to an axis beyond which the field grows
+_CENTRED = 1 / 8  # of the columns, from the detector's middle to an axis beyond which the field grows
 _BESIDE = 2  # rows beside that of the slice, by which the axis is found
 _MISSES = math.radians(2)  # by which a pair may miss half a turn
 
@@ -148,7 +148,8 @@ class ShownScan:
         geometry = Selection(rows=(self._band.start, self._band.stop)).of(self._source).geometry(axis_col, angles)
         whole = Grid.matching(geometry)
         cols, voxel, height = self._source.shape[1], whole.voxel_size, 0.0
-        n = cols if abs(axis_col - (cols - 1) / 2) < _NEAR * cols else whole.shape[1]  # else it jumps with each column
+        centred = abs(axis_col - (cols - 1) / 2) < _CENTRED * cols
+        n = cols if centred else whole.shape[1]  # else it jumps with each column
         shown, most = region.inside((n, n)), _FAST_MOST if fast else _MOST
         ends = (shown.first_row, shown.last_row), (shown.first_col, shown.last_col)
         step = -(-max(last - begin for begin, last in ends) // most)

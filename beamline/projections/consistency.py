@@ -46,7 +46,7 @@ _FEW = 0.2  # of the views: so many are named, however far they are off
 _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.009, 60 other scans at rest less
 # Off the turn with both ends, or without, which are a step apart; told of 31 of 40 other scans, falsely of none of 232.
 _OF_A_STEP = 1 / 3
-_NEAR = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
+_SAME_AXIS = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
 _FAINT = 0.3  # line integral: of matter fainter than that, as much as the air may have at an edge is a large part
 _FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
 _AIR = 0.1  # of the deepest line integral: as much as an edge may have where the sample is in the field
@@ -131,7 +131,7 @@ def _conditions_within_the_field(prepared: PreparedProjections, some: NDArray[np
     masses = _masses(shown, angles, frames, of_mass)
     if masses.broken:  # such views spoil the other moments
         return [masses]
-    near = abs(shown.axis_col - geometry.axis_col) <= _NEAR
+    near = abs(shown.axis_col - geometry.axis_col) <= _SAME_AXIS
     turn = _angles(shown, geometry.angles)
     if ends := _ends_of_turn(data, geometry, shown.stretch):
         turn = replace(turn, tolerance=_STRETCH, sentence=f"{ends} {turn.sentence}")

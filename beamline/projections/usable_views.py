@@ -171,12 +171,7 @@ def regions_of(treated: FlagPolicy) -> Regions:
     return Regions(np.array(frames, np.int64), np.array(boxes, np.int64).reshape(-1, 4), shares)
 
 
-def part_numbers(jumps: I64, rows: I64) -> I64:
-    """Number [row] of the part that contains each of these rows of the file; jumps ascend."""
-    return np.searchsorted(jumps, rows, side="right").astype(np.int64)
-
-
 def longest_part(frames: I64, jumps: I64) -> I64:
-    """The rows of the largest part."""
-    parts = part_numbers(jumps, frames)
+    """The rows of the largest part between jumps, which ascend."""
+    parts = np.searchsorted(jumps, frames, side="right")
     return frames[parts == np.bincount(parts).argmax()] if frames.size else frames

@@ -64,11 +64,6 @@ class Cursor:
         return self.taken < self.frames
 
     @property
-    def n_corrected(self) -> int:
-        """Number of views in `batches`."""
-        return sum(batch.view_ids.size for batch in self.batches)
-
-    @property
     def view_ids(self) -> NDArray[np.int64]:
         """Rows of the file of the views in `batches`."""
         return np.concatenate([batch.view_ids for batch in self.batches])

@@ -18,12 +18,17 @@ from beamline.core.recon_events import FitReached
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope
 from beamline.projections.prepared import PreparedProjections
-from beamline.reconstruct.budget import in_budget
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import RegionOfRows
-from beamline.reconstruct.run import candidate_named, deviation_by_slabs, deviation_of, run_on, without_outside
+from beamline.reconstruct.run import (
+    deviation_by_slabs,
+    deviation_of,
+    in_budget,
+    run_on,
+    without_outside,
+)
 from beamline.reconstruct.scan_facts import ScanFacts
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
 from drivers.base.clock import Clock
@@ -231,7 +236,8 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
         job.channels.warn("There are no error bars, because the reconstruction was stopped.")
         return made
     job.say("The volume is there; its error bars follow. Ctrl-C leaves them out.", "error_bars")
-    method = candidate_named(job.options.method_for(job.prepared.geometry), made.method)
+    method = job.options.method_for(job.prepared.geometry)
+    method = {each.name: each for each in method.alternatives}.get(made.method, method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
     given = made.volume, method, job.prepared, job.options
 

@@ -93,7 +93,8 @@ class ScanFollower:
     @property
     def n_views_taken(self) -> int:
         """Number of views that the fit has used."""
-        return self._cursor.n_corrected + (self._cursor.newest is not None)
+        cursor = self._cursor
+        return sum(batch.view_ids.size for batch in cursor.batches) + (cursor.newest is not None)
 
     @property
     def waiting(self) -> int:

@@ -105,9 +105,5 @@ def _templates() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    templates.filters["data_url"] = _data_url
+    templates.filters["data_url"] = lambda png: "data:image/png;base64," + base64.b64encode(png).decode("ascii")
     return templates
-
-
-def _data_url(png: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")

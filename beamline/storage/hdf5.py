@@ -23,7 +23,7 @@ from beamline.core.files import no_file
 from beamline.storage.disk_file import DiskFile, GrowingFile
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
-from beamline.storage.writer_lock import QUIET, LockFailure, abandoned, held_sentence, lock_failure, opened_whole
+from beamline.storage.writer_lock import QUIET, WITHOUT, LockFailure, abandoned, lock_failure, opened_whole
 
 COMMITTED = "/entry/progress/frames_committed"  # of our own files
 
@@ -95,7 +95,11 @@ def _unopened(
             f"{QUIET:.0f} s. Of a dead writer `h5clear -s {path}` clears the mark. Nothing was read."
         )
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
-        return DataError(held_sentence(path))
+        return DataError(
+            f"{path} is held by another program, which has it open to write (HDF5 got no lock on it). Close it there, "
+            f"or wait until that program has ended. With {WITHOUT} in the environment it is read as it is, perhaps "
+            "half written. Nothing was changed."
+        )
     return DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
 
 

@@ -92,14 +92,6 @@ def no_locks_sentence(place: Path, number: int | None = None) -> str:
     )
 
 
-def held_sentence(path: Path) -> str:
-    return (
-        f"{path} is held by another program, which has it open to write (HDF5 got no lock on it). Close it there, or "
-        f"wait until that program has ended. With {WITHOUT} in the environment it is read as it is, perhaps half "
-        "written. Nothing was changed."
-    )
-
-
 def opened_whole(path: Path, *, unlocked: bool = True) -> h5py.File:
     """Open for reading a file that no program is writing; without a lock if its file system has none.
 

@@ -32,7 +32,7 @@ ADD_ONS = {
     **dict.fromkeys(("materials", "xafs"), "splatline-spectral"),
 }
 """Names that packages beside this one add, and the package of each: folders of `packages/` in the repository."""
-_NEAR = 0.65  # of 1: from which likeness on a name may have been meant
+_LIKENESS = 0.65  # of 1: from which likeness on a name may have been meant
 
 T = TypeVar("T")
 
@@ -72,7 +72,7 @@ def nearest(name: object, legal: Iterable[str]) -> str:
     """The legal name that was probably meant; "" if none is near."""
     from difflib import get_close_matches  # here: only errors need it
 
-    return next(iter(get_close_matches(str(name), list(legal), n=1, cutoff=_NEAR)), "")
+    return next(iter(get_close_matches(str(name), list(legal), n=1, cutoff=_LIKENESS)), "")
 
 
 @contextmanager

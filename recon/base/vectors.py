@@ -24,7 +24,7 @@ from recon.base.placement import Where
 TOLERANCE = 0.1
 """Pixels by which a corner of the detector may lie off the one that the vectors state."""
 
-_FLAT = 1e-6  # of u, or v: what is left of the other one
+_PARALLEL = 1e-6  # of u, or v: what is left of the other one
 _CLEAN = 1e-9  # rad, pixels, or of the distance to the source: what is less is rounding
 
 
@@ -123,7 +123,7 @@ def _across(vectors: F64, rays: F64) -> F64:
 def _frame(u: F64, v: F64) -> tuple[F64, F64, F64]:
     """The orthonormal pair nearest to each (u, v), by their polar decomposition, and the beam onto such a detector."""
     left, sizes, right = np.linalg.svd(np.stack((u, v), axis=2), full_matrices=False)
-    flat = sizes[:, 1] <= _FLAT * sizes[:, 0]
+    flat = sizes[:, 1] <= _PARALLEL * sizes[:, 0]
     if flat.any():
         view = int(np.flatnonzero(flat)[0])
         raise ValueError(f"view {view}: u and v are zero, parallel, or along the beam: {u[view]} and {v[view]}")

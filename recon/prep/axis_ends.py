@@ -14,7 +14,7 @@ _FEWEST = 8 * _SIDE  # views that tell their covariance without those of a join
 _NOISE = 0.01  # of the power, in the views' covariance: what the field cuts off is not in it
 _FINER, _BLOCKS = 8, 8  # candidates a column; blocks of views, at most
 _SURE = 0.3  # columns by which the median of the joins within the scan may be off
-_CLEAR, _NEAR = 0.4, 24  # less mismatch than of axes a 24th of the field away; right ones had 0.48, wrong ones to 0.3
+_CLEAR, _RIVAL = 0.4, 24  # less mismatch than of axes a 24th of the field away; right ones had 0.48, wrong ones to 0.3
 
 
 def axis_from_ends(projections: NDArray[np.floating], angles: Floats) -> AxisEstimate:
@@ -51,7 +51,7 @@ def axis_from_ends(projections: NDArray[np.floating], angles: Floats) -> AxisEst
         curve[at] = np.minimum(curve[at], values)
     candidates, curve = np.flatnonzero(np.isfinite(curve)) / _FINER, curve[np.isfinite(curve)]
     value, _ = optimum(candidates, curve)
-    rivals = curve[np.abs(candidates - candidates[curve.argmin()]) > cols / _NEAR]
+    rivals = curve[np.abs(candidates - candidates[curve.argmin()]) > cols / _RIVAL]
     confident = bool(error < _SURE and rivals.min() - curve.min() > _CLEAR)
     return AxisEstimate(value, candidates, curve, confident, ENDS)
 

@@ -18,7 +18,7 @@ _LEVELS = 1, 4, 16  # rows averaged on either side of the comparison: a can show
 MOST_VIEWS = 96  # that are looked at
 _BLOCKS = 16  # groups of rows, of each level
 _AVERAGED = 16  # neighbouring views that are averaged, too, as a can is alike from all sides
-_AIR, _NEAR = 6, 3  # columns of air that an edge needs, and those next to it, where the overshoot is sought
+_AIR, _BESIDE = 6, 3  # columns of air that an edge needs, and those next to it, where the overshoot is sought
 _EDGE, _OF_DEEPEST = 6.0, 0.02  # times the noise, and of the deepest line integrals, where matter begins
 _FEWEST = 6  # places of edges that are needed
 _AGREE, _ERRORS = 2.0, 6.0  # least standard errors: by how the places agree, by the noise of the air
@@ -89,12 +89,12 @@ def _overshoot(halves: F32) -> Overshoot:
     places = int(at.max(initial=-1)) + 1
     if places < _FEWEST:
         return Overshoot()
-    below = rays[:, 1 + _NEAR :].mean(axis=1, dtype=np.float64)[:, None] - rays
+    below = rays[:, 1 + _BESIDE :].mean(axis=1, dtype=np.float64)[:, None] - rays
     mean = below.mean(axis=0)
     scatter = np.square([np.bincount(at, column) for column in (below - mean).T]).sum(axis=1) * places / (places - 1)
-    errors = np.sqrt(scatter[1 : 1 + _NEAR]) / len(below) + 1e-9
-    noise = np.sqrt(2 * scatter[1 + _NEAR :].mean()) / len(below) + 1e-9  # beside the mean of three columns
-    by_noise = np.where(mean[1 : 1 + _NEAR] > _AGREE * errors, mean[1 : 1 + _NEAR] / noise, 0)
+    errors = np.sqrt(scatter[1 : 1 + _BESIDE]) / len(below) + 1e-9
+    noise = np.sqrt(2 * scatter[1 + _BESIDE :].mean()) / len(below) + 1e-9  # beside the mean of three columns
+    by_noise = np.where(mean[1 : 1 + _BESIDE] > _AGREE * errors, mean[1 : 1 + _BESIDE] / noise, 0)
     k = int(by_noise.argmax())
     return Overshoot(float(mean[1 + k] / -mean[0]), float(by_noise[k])) if mean[0] < 0 < by_noise[k] else Overshoot()
 

@@ -14,7 +14,7 @@ from recon.base.views import spread
 
 _COLUMNS, _LEAST_ROWS, _LEAST_VIEWS = 64, 6, 12  # columns after binning, about; fewer rows or views tell nothing
 _SMOOTH, _EDGE = 1.5, 2  # pixels: standard deviation of the smoothing, and those left out at either edge
-_EXACT, _NEAR = 0.1, 2.3  # pixels between two rays at the edge of the field: beyond, the difference is not linear
+_EXACT, _LINEAR = 0.1, 2.3  # pixels between two rays at the edge of the field: beyond, the difference is not linear
 _LATER, _LONGEST = 3, 0.9  # a pair lies a third of the scan apart at least; share of the longest time between two
 _FIRSTS, _PAIRS, _BANDS = 512, 8, 4  # views whose pairs are sought, at most; pairs; bands of rows, which may disagree
 _CORRELATED = 2 * 4 * np.pi * _SMOOTH**2  # pixels whose errors are one: those that the Gaussian joins, twice
@@ -65,7 +65,7 @@ def _pairs(geometry: Geometry, reach: float) -> Iterator[list[tuple[int, int]]]:
     angles, views, period = geometry.angles, np.arange(geometry.n_views), geometry.period
     firsts = spread(views, _FIRSTS)
     later, off = views - firsts[:, None], np.abs((angles - angles[firsts, None] + period / 2) % period - period / 2)
-    for least in (_EXACT, _NEAR):
+    for least in (_EXACT, _LINEAR):
         row, second = np.nonzero((later >= views.size // _LATER) & (off <= least / reach))
         if row.size:
             first, apart, between = firsts[row], off[row, second], later[row, second]

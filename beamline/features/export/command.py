@@ -50,10 +50,6 @@ def window_of(text: str) -> tuple[float, float]:
     return low, high
 
 
-def _output_path(text: str) -> Path:
-    return Path(text) if Path(text).suffix.lower() in (_PLY, _CSV) else volume_path(text)
-
-
 @dataclass(frozen=True, eq=False)
 class ExportRequest:
     """What `beamline export` is asked for."""
@@ -63,7 +59,7 @@ class ExportRequest:
         "-o",
         "--output",
         metavar="PATH",
-        callback=parsed(_output_path),
+        callback=parsed(lambda text: Path(text) if Path(text).suffix.lower() in (_PLY, _CSV) else volume_path(text)),
         required=True,
         help=f"Its suffix names the format: {suffixes_text()}; with --gaussians .ply, with --poses .csv.",
     )

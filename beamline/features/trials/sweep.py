@@ -37,7 +37,7 @@ from recon.voxels.projector import Projector, projection_lines
 from recon.voxels.residuals import squares_left
 from recon.voxels.resolution import ViewResolution
 
-_FLAT = 0.05  # share by which the residual of a direct method must change: one of 0.03 named an axis 0.7 columns off
+_LEAST_CHANGE = 0.05  # share of the residual of a direct method: 0.03 named an axis that was 0.7 columns off
 _NUMBER = re.compile(rf"[-+]?{NUMBER}")
 _NO_SCORE = "No score: the values change pixels or views, so the slices cannot be compared with the same views."
 _OTHER_VIEWS = (
@@ -255,7 +255,7 @@ def scores_of(slices: Mapping[str, UnseenViews], *, direct: bool = False) -> tup
         raise DataError("The views held out show nothing: there is nothing to compare the slices with.")
     residuals = [np.sum([np.sqrt(of.left) for of in row], axis=0) / scale for row in sums]
     predictions = (Prediction(name, left.tolist()) for name, left in zip(slices, residuals, strict=True))
-    return TrialChoice(f"{len(common)} views", _FLAT if direct else 0.0, tuple(predictions)), same
+    return TrialChoice(f"{len(common)} views", _LEAST_CHANGE if direct else 0.0, tuple(predictions)), same
 
 
 def shares_of(choice: TrialChoice) -> list[float]:

@@ -38,7 +38,7 @@ _LEGENDS = {
     "best": "*: the least residual.",
     "alike": "~: no more than that, but for chance.",
 }
-_NEAR = 1.0  # dB below the best figure: a tenth more error
+_ALIKE_DB = 1.0  # dB below the best figure: a tenth more error
 _WIDTH = 120  # characters
 
 
@@ -151,7 +151,7 @@ def _conclusions(table: TrialTable) -> list[str]:
     if not front:
         return ["No trial has both a time and a quality."]
     best = front[-1]
-    pick = next(outcome for outcome in front if outcome.quality(by) >= best.quality(by) - _NEAR)
+    pick = next(outcome for outcome in front if outcome.quality(by) >= best.quality(by) - _ALIKE_DB)
     out = [f"Best for its time: {pick.trial.label}: {pick.quality(by):.2f} dB in {_seconds(pick.seconds)} s."]
     out += [f"Quality: {_QUALITY[by]}. Fastest: {front[0].trial.label}, {front[0].quality(by):.2f} dB."]
     for before, after in pairwise(front):

@@ -137,8 +137,3 @@ def stated_frames_per_view(source: ScanSource) -> int:
     """Frames per view by the plan in the file; 1 if it has no plan."""
     stated = source.plan.get("frames_per_view", 1)
     return stated if isinstance(stated, int) and stated > 1 else 1
-
-
-def angles_of_frames(angles: NDArray[np.float64], source: ScanSource, n: int) -> NDArray[np.float64]:
-    """Angles [frame]: if one is given for each view, it applies to the view's n frames."""
-    return np.repeat(angles, n) if angles.size * n == source.table.views.size else angles

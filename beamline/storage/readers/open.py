@@ -18,7 +18,7 @@ from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays
 from beamline.storage.hdf5 import NotReadyError
 from beamline.storage.readers.angle_files import Angles, angles_at, assign, load_angles, parse_angles, select_rows
-from beamline.storage.readers.averaged import AveragedSource, angles_of_frames, stated_frames_per_view
+from beamline.storage.readers.averaged import AveragedSource, stated_frames_per_view
 from beamline.storage.readers.base import Opening, Quantity, ScanFormat, ScanSource, Stated, read_known
 from beamline.storage.readers.dxchange import FORMAT as EXCHANGE
 from beamline.storage.readers.dxchange import open_exchange
@@ -207,7 +207,9 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
         base, options.order if options.data_path is None else None, None if angles is None else angles.size
     )
     if angles is not None:
-        angles = angles_of_frames(angles, base, n if views is None else views.step or 1)
+        of_each = n if views is None else views.step or 1
+        if angles.size * of_each == base.table.views.size:  # one for each view applies to its frames
+            angles = np.repeat(angles, of_each)
         assigned = assign(base, angles, angles_from, of_views=options.angle_rows is not None)
         base = Frames(base, table=lambda known: replace(known, angles=assigned))
     if views is not None:

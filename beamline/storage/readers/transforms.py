@@ -279,7 +279,7 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
 
 
 WRAPPED = "wrapped-numbers"  # a rule
-_NEAR, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
+_END_PART, _A_ROW = 10, 0.1  # a part of the range that is near its end; edges a row from which they are no zingers
 _ALIKE = 0.05  # of the changes above an edge are below it, where both are light; behind a slit there is readout alone
 _SMOOTH = 3.0  # times the least change beside an edge: the step across the end, where one smooth image goes on there
 
@@ -295,14 +295,14 @@ def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any]
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
         return 0
     counts, whole = images.astype(np.int64) - np.iinfo(dtype).min, 2**16
-    top, upper = counts >= whole - whole // _NEAR, counts >= whole // 2
-    ends = np.where(top, 1, -1 * (counts < whole // _NEAR))
+    top, upper = counts >= whole - whole // _END_PART, counts >= whole // 2
+    ends = np.where(top, 1, -1 * (counts < whole // _END_PART))
     steps = (ends[..., 1:-2] * ends[..., 2:-1] < 0) & (upper[..., :-3] == upper[..., 1:-2])
     steps &= upper[..., 2:-1] == upper[..., 3:]
     change, above = np.abs(np.diff(counts)), upper[..., 1:-2]
     if flat is not None:
         flat = flat - np.iinfo(dtype).min
-        lit = flat >= whole - whole // _NEAR
+        lit = flat >= whole - whole // _END_PART
         beside = np.maximum(np.minimum(change[..., :-2], change[..., 2:]), 1)
         steps &= ~(lit[..., 1:-2] & lit[..., 2:-1]) | (whole - change[..., 1:-1] <= _SMOOTH * beside)
     edges = int(steps.sum())

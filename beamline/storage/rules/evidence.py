@@ -25,7 +25,7 @@ from recon.prep.references import dark_at
 from recon.prep.unmeasured import with_borders_filled
 
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
-CELLS = 32  # across the frame, about, by which flats are compared with views
+CELLS_ACROSS = 32  # the frame, about: means of pixels by which flats are compared with views
 WORST = 99.0  # percentile of the places of a view that counts, so that zingers do not
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 LEAST = 0.01  # share of the light of the brightest views, in a view's own bright part: all matter leaves that much open
@@ -311,7 +311,7 @@ def look_at(image: NDArray[Any], row: int) -> FrameStatistics:
     """Statistics of an image, with its cells."""
     counts, block = image.dtype.kind in "ui", check_block(image.shape)
     saturated = float(np.mean(image >= full_scale(float(image.max())))) if counts else 0.0
-    blocks, cells = (block_means(image, side) for side in (block, max(1, image.shape[1] // CELLS)))
+    blocks, cells = (block_means(image, side) for side in (block, max(1, image.shape[1] // CELLS_ACROSS)))
     invalid = 0.0 if image.dtype == np.uint16 else 1 - float(np.mean(is_valid(image)))
     kind, rounding = FrameKind.INVALID, LEAST_NOISE * counts
     return FrameStatistics(row, kind, np.nan, saturated, np.array(subsampled(blocks)), block, rounding, invalid, cells)

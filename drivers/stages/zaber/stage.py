@@ -15,8 +15,7 @@ from drivers.base.errors import DeviceError, DeviceRefused
 from drivers.base.protocols import TriggerTrain
 from drivers.stages.shared import LineStage, StageOutput, found_at_opening, refuse_another, until_standing
 from drivers.stages.travel import Travel
-from drivers.stages.zaber.axis import WHOLE, ZaberAxis, ZaberAxisStatus
-from drivers.stages.zaber.packet import INTERRUPTED, LOST, SLIPPED, meaning_of
+from drivers.stages.zaber.axis import INTERRUPTED, LOST, SLIPPED, WHOLE, ZaberAxis, ZaberAxisStatus, meaning_of
 from drivers.stages.zaber.settings import ZaberSettings, set_up
 
 ADVICE = (

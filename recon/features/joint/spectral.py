@@ -22,7 +22,7 @@ from recon.features.joint.energy_fit import EnergyFit, EnergyViews, fitted, tria
 
 TRIAL_ROWS, _TRIAL_SWEEPS = 16, 8  # of a trial of weights, which begins with the volumes of the last one
 _LITTLE, _LEAST = 0.1, 0.1  # light of the open beam; weight of a ray
-_NEAR = 1.5  # pixels, over which depth is averaged
+_AVERAGED = 1.5  # pixels, over which depth is averaged
 _FIRST = 0.1  # the first weight, over the largest gradient at zero
 ALIKE_LONGER = 3  # times the sweeps: volumes of times differ by more than materials of energies
 _TRIALS = 12  # of one weight for all components, each half of the last one
@@ -114,8 +114,8 @@ def _weighed(views: EnergyViews) -> EnergyViews:
     there = np.ones_like(views.projections) if views.weight is None else (views.weight > 0).astype(np.float32)
     light = np.empty_like(there)
     for view, image in enumerate(views.projections):
-        near = gaussian_filter(there[view], _NEAR)
-        light[view] = np.exp(-gaussian_filter(there[view] * image, _NEAR) / np.maximum(near, 1e-3))
+        near = gaussian_filter(there[view], _AVERAGED)
+        light[view] = np.exp(-gaussian_filter(there[view] * image, _AVERAGED) / np.maximum(near, 1e-3))
     weight = weight_of(light)
     if views.weight is not None:
         weight *= np.minimum(1, views.weight / (_LITTLE * (float(views.weight.max()) or 1)))

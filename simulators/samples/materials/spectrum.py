@@ -17,7 +17,7 @@ Reals = NDArray[np.float64]
 Attenuation = Callable[[ArrayLike], Reals]  # Linear attenuation in 1/mm at energies in keV
 
 NODES = (3, 5, 9, 17, 33, 65, 129, 257, 513)
-ENOUGH = 1e-5  # Tolerance, as a share of the open beam: far below the noise of a pixel with 7000 electrons
+TOLERANCE = 1e-5  # of the open beam, in the light: far below the noise of a pixel with 7000 electrons
 _FWHM = math.sqrt(8 * math.log(2))
 _LEAST_KEV = 1.0
 _NOTHING = 1e-7  # share of the light: smaller weights, of energies that a filter stops, are dropped
@@ -81,7 +81,7 @@ def light(
     if spectrum.energies.size <= _A_FEW or not attenuations:
         return spectrum
     attenuation = np.stack([material(spectrum.energies) for material in attenuations], axis=1)
-    kept, weights = fewer(attenuation, spectrum.weights, thickness, ENOUGH / 5)
+    kept, weights = fewer(attenuation, spectrum.weights, thickness, TOLERANCE / 5)
     return Spectrum(spectrum.energies[kept], weights)
 
 
@@ -93,7 +93,7 @@ def _converged(
     for n in NODES[1:]:
         now = _nodes(beam, n, filters)
         changes = [np.abs(now.transmission(m, ladder) - before.transmission(m, ladder)).max() for m in attenuations]
-        if max(changes, default=0.0) <= ENOUGH:
+        if max(changes, default=0.0) <= TOLERANCE:
             return before
         before = now
     return before

@@ -155,12 +155,9 @@ class PM16CBox:
             name: Channel(PulseMotor(clock, _unplugged, counts_per_turn=turn)) for name in "0123456789ABCDEF"
         }
 
-        def tp0() -> TriggerLine | None:
-            return line if self.mapped[0] == sample else None
-
         self.sample = PulseMotor(
             clock,
-            tp0,
+            lambda: line if self.mapped[0] == sample else None,  # TP0
             counts_per_turn=turn,
             lost=build.lost,
             stall_at=build.stall_at,

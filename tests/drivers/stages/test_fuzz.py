@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from drivers.base.errors import DeviceError
 from drivers.base.protocols import RotationStage, TriggerTrain
-from drivers.stages.zaber.packet import lrc
+from drivers.stages.zaber.axis import lrc
 from simulators.wires.wire import register
 from tests.drivers import pm16c_rig, zaber_rig
 from tests.drivers.fuzz import FuzzedWire, Pieces, allowed, plans

@@ -7,8 +7,7 @@ from contextlib import ExitStack, closing
 
 import pytest
 
-from beamline.features.page.entrance import SILENT, STRANGERS, Entrance
-from beamline.features.page.serve import open_port
+from beamline.features.page.serve import SILENT, STRANGERS, Entrance, open_port
 
 TOKEN = b"0123456789abcdef"
 ASKED = b"GET / HTTP/1.1\r\nCookie: splatline=" + TOKEN + b"\r\n\r\n"

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.stages.zaber.packet import ENDINGS, FAULTS, Reply, damage, encode, lrc, meaning_of, reply_form
+from drivers.stages.zaber.axis import ENDINGS, FAULTS, Reply, damage, encode, lrc, meaning_of, reply_form
 from tests.drivers.zaber_vectors import VECTORS
 from tests.simulators.wires.zaber.wire import frame
 

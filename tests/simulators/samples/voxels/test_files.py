@@ -12,8 +12,7 @@ from simulators.frame.shot import Detector
 from simulators.light import Beam
 from simulators.samples.composed import build_sample
 from simulators.samples.sample import Stored
-from simulators.samples.voxels.files import VolumeSettings, volume_sample
-from simulators.samples.voxels.voxels import Voxels
+from simulators.samples.voxels.voxels import VolumeSettings, Voxels, volume_sample
 from simulators.scenes.scene import load_scene
 
 VALUES = np.arange(60, dtype=np.int16).reshape(3, 4, 5) - 10
