@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from grain_scenes import Scene
 
+from beamline import api
 from splatline_structure import pictures
 from tests.beamline.cli.small_scan import beamline, left
 
@@ -69,6 +70,15 @@ def test_intervals_against_views_are_wider_for_fewer(here: Path) -> None:
     few, all_ = rows[1], rows[3]
     assert few["value"] == "not determined" or float(few["views"]) > float(all_["views"])
     assert (here / "scan_views/report.html").is_file()
+
+
+def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(api, "reconstruct", None)
+    result = beamline("structure-study", "scan.h5", "--views", "16,64", "--number", "fraction_3")
+    assert result.exit_code == 2 and "--number fraction_3: expected one of fraction_1, fraction_2, surf" in result.stderr
+    assert "tortuosity_x." in result.stderr and left(here) == {"scan.h5"}
 
 
 @pytest.mark.parametrize(("views", "words"), [("8,64", "16 views or more"), ("many", "invalid literal")])
