@@ -97,8 +97,9 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
     """Measure the microstructure of VOLUME: fractions of materials, particles, surface, contacts, cracks, connected
     share and tortuosity, each with an interval of 80 %.
 
-    The interval has three causes: the views (the volume is made again from each half of them), the levels of the
-    materials, and the size of a voxel. Where it is wider than half of the value, the number is given as not determined.
+    The interval has four causes: the views (the volume is made again from each half of them), the levels of the
+    materials, the size of a voxel, and the number of particles. Where it is wider than half of the value, the number is
+    given as not determined.
 
     Several volumes are a series in time. The new folder gets report.html, numbers.csv, structure.json, particles.csv
     and labels.

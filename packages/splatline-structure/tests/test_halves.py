@@ -77,7 +77,9 @@ def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
 ) -> None:
     monkeypatch.setattr(api, "reconstruct", None)
     result = beamline("structure-study", "scan.h5", "--views", "16,64", "--number", "fraction_3")
-    assert result.exit_code == 2 and "--number fraction_3: expected one of fraction_1, fraction_2, surf" in result.stderr
+    assert (
+        result.exit_code == 2 and "--number fraction_3: expected one of fraction_1, fraction_2, surf" in result.stderr
+    )
     assert "tortuosity_x." in result.stderr and left(here) == {"scan.h5"}
 
 
