@@ -68,7 +68,7 @@ def structure_study(
     values |= {"crop": "square", "radius": 1, "smallest": 27, "neck": NECK, "side": 96, "through": 1}
     with answering(as_json) as answer:
         refuse_existing(output)
-        thresholds = np.arange(1.0, materials)
+        thresholds = np.arange(1.0, materials)  # of nothing, for the names of numbers
         known = structure_of(np.zeros((2, 2, 2), np.float32), thresholds, (1, 1, 1), Rules(materials, 1)).numbers
         if unknown := set(names) - set(known):
             raise click.UsageError(f"--number {min(unknown)}: expected one of {', '.join(known)}.")
