@@ -16,6 +16,7 @@ from beamline.core.text import safe_name
 
 if TYPE_CHECKING:
     from splatline_structure.intervals import Found
+    from splatline_structure.volumes import Box
 
 _FILE = click.Path(path_type=Path)
 _SUFFIXES = {"h5": ".h5", "tif": ".tif", "zarr": ".zarr"}
@@ -96,8 +97,9 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
     """Measure the microstructure of VOLUME: fractions of materials, particles, surface, contacts, cracks, connected
     share and tortuosity, each with an interval of 80 %.
 
-    The interval has three causes: the views (the volume is made again from each half of them), the levels of the
-    materials, and the size of a voxel. Where it is wider than half of the value, the number is given as not determined.
+    The interval has four causes: the views (the volume is made again from each half of them), the levels of the
+    materials, the size of a voxel, and the number of particles. Where it is wider than half of the value, the number is
+    given as not determined.
 
     Several volumes are a series in time. The new folder gets report.html, numbers.csv, structure.json, particles.csv
     and labels.
@@ -123,14 +125,17 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
 
 def _seen(path: Path, answer: Answer, **values: Any) -> Seen:
     """One volume, and what was found in it."""
-    from splatline_structure.volumes import read_volume
+    from splatline_structure.volumes import box_in, read_volume
 
     record = read_volume(path, values["dataset"], values["voxel_um"], values["slices"])
-    return measured(path, record, answer, **values)
+    return measured(path, record, box_in(record.volume.data, values["crop"] == "square"), answer, **values)
 
 
-def measured(path: Path, record: Any, answer: Answer, **values: Any) -> Seen:
+def measured(path: Path, record: Any, box: Box, answer: Answer, **values: Any) -> Seen:
     """What was found in the volume of a record.
+
+    Args:
+        box: that is looked at, also in the volumes from parts of the views.
 
     Raises:
         ConfigError: a material that is not there. ValueError: no contrast, or parts of other shapes.
@@ -139,14 +144,12 @@ def measured(path: Path, record: Any, answer: Answer, **values: Any) -> Seen:
 
     from splatline_structure.intervals import found_in
     from splatline_structure.numbers import Rules
-    from splatline_structure.volumes import box_in
 
     count, particles = values["materials"], values["particles"] or values["materials"]
     if max(particles, values["through"]) > count:
         raise ConfigError(
             f"Material {max(particles, values['through'])} of {count}: they are numbered from 1. Nothing was written."
         )
-    box = box_in(record.volume.data, values["crop"] == "square")
     grid, volume = record.grid.part(*box), np.ascontiguousarray(record.volume.data[box])
     first, end = values["slices"] or (0, None)
     parts = []

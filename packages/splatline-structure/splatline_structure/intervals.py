@@ -1,4 +1,4 @@
-"""Intervals: each number as value, low and high, by the views, by the levels and by the voxels."""
+"""Intervals: each number as value, low and high, by the views, levels, voxels and particles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from splatline_structure.materials import F32, Materials, materials_of, probabilities
 from splatline_structure.numbers import Rules, Structure, coarse, structure_of
-from splatline_structure.particles import Spacing
+from splatline_structure.particles import Particles, Spacing
 
 Told = Callable[[int, int], None]
 Numbers = Mapping[str, float]
@@ -19,11 +19,14 @@ BIAS_UNSURE, NOISE = 0.5, 1.5
 """Half-width by the views: over what half of them change a number by, and over half the difference of both halves."""
 PROBED, PARTIAL = 0.05, 0.012
 """Of the gap of two levels: by how much thresholds are moved to see what they do, and may lie off by partial voxels."""
-OF_KIND = {"fraction": (0.5, 0.3), "surface": (0.5, 0.2), "size": (0.0, 0.15), "tortuosity": (0.0, 0.1)}
+OF_KIND = {"fraction": (0.5, 0.3), "surface": (0.5, 0.2), "size": (0.0, 0.05), "tortuosity": (0.0, 0.04)}
 """By the first word of a number's name: what all views would still change it by, over what half of them do, and the
-half-width over what voxels twice as wide change it by; of others OTHERS. Found, as the figures above, on ten simulated
-scenes of grains, and looked at once on ten others (docs/structure.md). Sizes and tortuosities moved either way."""
+half-width over what voxels twice as wide change it by; of others OTHERS. Found, as the figures above, on simulated
+grains, and looked at once on others (docs/structure.md). Sizes and tortuosities moved either way."""
 OTHERS = 0.5, 0.3
+OTHERWISE = 0.62
+"""Of n whole particles some are split, merged or cut otherwise than in the sample: the share s of their volume below a
+size lies off by this times √(s (1 - s) / n). Found on twenty scenes (docs/structure.md)."""
 LEVELS_MOVE = 0.5  # thresholds, over what half of the views move them by
 UNDECIDED, SURE = 0.15, 0.8
 """Most voxels that may be undecided, and the probability of one material from which on a voxel is decided."""
@@ -32,6 +35,7 @@ CAUSES = {
     "views": "more views would narrow this",
     "levels": "the threshold decides this, not the views",
     "voxels": "the size of a voxel decides this, not the views",
+    "particles": "more whole particles would narrow this: a larger field",
 }
 _SHARES = "fraction", "sphericity", "cracks", "connected"
 
@@ -43,7 +47,7 @@ class Interval:
     Attributes:
         low, high: around the value as it would be with all views there could be.
         moves: what more views would still change the value by, extrapolated; NaN: the views were not parted.
-        views, levels, voxels: half-widths by each cause.
+        views, levels, voxels, particles: half-widths by each cause.
         why_not: why the number is not determined; empty: it is.
     """
 
@@ -54,6 +58,7 @@ class Interval:
     views: float = math.nan
     levels: float = math.nan
     voxels: float = math.nan
+    particles: float = math.nan
     why_not: str = ""
 
     @property
@@ -133,14 +138,38 @@ def found_in(
     made = {
         name: Interval(value, why_not=why)
         if why
-        else _interval(name, value, [half.numbers[name] for half in halves], [s[name] for s in sides], wide[name], off)
+        else _interval(
+            name,
+            value,
+            [half.numbers[name] for half in halves],
+            [side[name] for side in sides],
+            wide[name],
+            off,
+            _of_particles(name, whole.particles),
+        )
         for name, value in whole.numbers.items()
     }
     return Found(whole, materials, made, undecided, unsure, tuple(halves), off)
 
 
+def _of_particles(name: str, particles: Particles) -> float:
+    """Half-width of a quantile of sizes, as particles split, merge or are cut otherwise; 0 of another number."""
+    kind, _, percent = name.partition("_")
+    if kind != "size" or particles.cut.all():
+        return 0.0
+    share = int(percent) / 100
+    off = OTHERWISE * math.sqrt(share * (1 - share) / np.count_nonzero(~particles.cut))
+    return (particles.quantile(share + off) - particles.quantile(share - off)) / 2
+
+
 def _interval(
-    name: str, value: float, halves: Sequence[float], sides: Sequence[float], wide: float, off: float
+    name: str,
+    value: float,
+    halves: Sequence[float],
+    sides: Sequence[float],
+    wide: float,
+    off: float,
+    of_particles: float,
 ) -> Interval:
     kind = name.split("_")[0]
     if not math.isfinite(value):
@@ -153,7 +182,7 @@ def _interval(
     moves, views = still * change, math.hypot(BIAS_UNSURE * change, NOISE * float(np.ptp(halves or [0.0])) / 2)
     levels = abs(sides[0] - sides[1]) / 2 * off / PROBED
     voxels = of_voxels * abs(wide - value)
-    half = max(math.hypot(np.nan_to_num(views), levels, voxels), NARROWEST * abs(value))
+    half = max(math.hypot(np.nan_to_num(views), levels, voxels, of_particles), NARROWEST * abs(value))
     middle = value + float(np.nan_to_num(moves))
     low, high = max(middle - half, float(kind == "tortuosity")), middle + half
     if kind in _SHARES:
@@ -161,7 +190,7 @@ def _interval(
     why = ""
     if high - low > WIDEST * abs(value):
         why = f"the interval is {low:.3g} to {high:.3g}, wider than half of the value"
-    return Interval(value, low, high, moves, views, levels, voxels, why)
+    return Interval(value, low, high, moves, views, levels, voxels, of_particles, why)
 
 
 def difference(one: Interval, other: Interval) -> Interval:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import ndtr
 from scipy.stats import trim_mean
+from skimage.morphology import ball
 
 from recon.post import clusters
 
@@ -83,7 +84,7 @@ def materials_of(volume: F32, count: int, seed: int = 0) -> Materials:
 
 def _core(volume: F32, mask: Mask, k: int, count: int) -> F32:
     """Values of a material away from its edges; where it has no room for that, those that lie farthest from others."""
-    core = volume[ndimage.distance_transform_edt(mask) > _CORE]
+    core = volume[ndimage.binary_erosion(mask, ball(_CORE), border_value=1)]
     if core.size >= _LEAST:
         return core
     values = volume[mask]

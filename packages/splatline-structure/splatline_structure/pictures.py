@@ -1,4 +1,4 @@
-"""Pictures of a structure: a slice with its labels, curves with bands, and bars of the three causes."""
+"""Pictures of a structure: a slice with its labels, curves with bands, and bars of the causes."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def causes(intervals: Mapping[str, Interval]) -> bytes:
     axes = figure.subplots()
     for k, cause in enumerate(CAUSES):
         widths = [100 * np.nan_to_num(getattr(each, cause)) / abs(each.value) for each in shown.values()]
-        axes.barh(np.arange(len(shown)) + 0.27 * (k - 1), widths, 0.25, label=cause)
+        axes.barh(np.arange(len(shown)) + 0.2 * (k - 1.5), widths, 0.18, label=cause)
     axes.set_yticks(range(len(shown)), list(shown))
     axes.invert_yaxis()
     finish(axes, "half-width (% of the value)", "", size=8)

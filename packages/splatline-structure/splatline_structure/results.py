@@ -20,16 +20,16 @@ from beamline.storage.volumes.base import Pixels
 from beamline.storage.volumes.files import write_volume
 from beamline.storage.writers.recon_file import new_plot
 from recon import Grid, Volume
-from splatline_structure.intervals import Found, Interval
+from splatline_structure.intervals import CAUSES, Found, Interval
 from splatline_structure.numbers import unit_of
 from splatline_structure.particles import Particles
 
-COLUMNS = "number", "unit", "value", "low", "high", "decides", "moves", "views", "levels", "voxels"
+COLUMNS = "number", "unit", "value", "low", "high", "decides", "moves", *CAUSES
 
 
 def cells(name: str, interval: Interval) -> list[str]:
     """A row of `COLUMNS`; numbers that are not determined are given as such."""
-    figures = [f"{getattr(interval, each):.4g}" for each in ("moves", "views", "levels", "voxels")]
+    figures = [f"{getattr(interval, each):.4g}" for each in ("moves", *CAUSES)]
     if interval.why_not:
         return [name, unit_of(name), "not determined", "", "", interval.why_not, *figures]
     ends = [f"{each:.4g}" for each in (interval.value, interval.low, interval.high)]

@@ -47,10 +47,14 @@ def structure_study(
 
     Before a beamtime, SCAN is one of `beamline simulate`: so it says how many views a wanted interval takes.
     """
-    from beamline.api import reconstruct
+    import numpy as np
+
+    from beamline.api import Selection, reconstruct
     from beamline.report.html import Picture
     from splatline_structure import pictures, results
+    from splatline_structure.numbers import Rules, structure_of
     from splatline_structure.particles import NECK
+    from splatline_structure.volumes import box_in
 
     output = output or Path(f"{safe_name(scan.name.split('.')[0])}_views")
     values: dict[str, Any] = {
@@ -64,24 +68,26 @@ def structure_study(
     values |= {"crop": "square", "radius": 1, "smallest": 27, "neck": NECK, "side": 96, "through": 1}
     with answering(as_json) as answer:
         refuse_existing(output)
-        series: list[dict[str, Any]] = []
-        for n in views:
-            record = reconstruct(scan, method, views=f"fixed:{n}", say=None)
+        thresholds = np.arange(1.0, materials)  # of nothing, for the names of numbers
+        known = structure_of(np.zeros((2, 2, 2), np.float32), thresholds, (1, 1, 1), Rules(materials, 1)).numbers
+        if unknown := set(names) - set(known):
+            raise click.UsageError(f"--number {min(unknown)}: expected one of {', '.join(known)}.")
+        tell, series, axis_col, box = answer.counting("numbers of views"), {}, None, None
+        for done, n in enumerate(sorted(views, reverse=True)):  # axis and box are those of the most views
+            tell(done, len(views))
+            record = reconstruct(scan, method, views=f"fixed:{n}", selection=Selection(axis_col=axis_col), say=None)
             if record.length_unit != "mm":
                 raise DataError(f"{scan} does not state the size of a pixel. Nothing was written.")
+            axis_col = record.axis_col
             try:
-                intervals = measured(scan, record, answer, **values).found.intervals
+                box = box or box_in(record.volume.data, True)
+                series[n] = measured(scan, record, box, answer, **values).found.intervals
             except ValueError as error:
                 raise DataError(f"{n} views of {scan} cannot be measured: {error}. Nothing was written.") from error
-            if unknown := set(names) - set(intervals):
-                raise click.UsageError(f"--number {min(unknown)}: expected one of {', '.join(intervals)}.")
-            series.append(intervals)
-        rows = [
-            [str(n), *results.cells(name, each[name])] for n, each in zip(views, series, strict=True) for name in names
-        ]
-        curves = pictures.curves_of({name: [each[name] for each in series] for name in names}, views, "views")
+        rows = [[str(n), *results.cells(name, series[n][name])] for n in views for name in names]
+        curves = pictures.curves_of({name: [series[n][name] for n in views] for name in names}, views, "views")
         shown = [Picture("Numbers against views", "Values with their intervals; gaps are not determined.", curves)]
-        table = {f"{row[1]}, {row[0]} views": series[views.index(int(row[0]))][row[1]] for row in rows}
+        table = {f"{row[1]}, {row[0]} views": series[int(row[0])][row[1]] for row in rows}
         page = results.page(f"Structure of {scan.name} against views", method, [], shown, table, {"scan": scan})
         with atomic_file(output) as folder:
             folder.mkdir()

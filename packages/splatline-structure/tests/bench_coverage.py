@@ -1,4 +1,4 @@
-"""Coverage of the intervals on simulated scenes: python bench_coverage.py built_on|looked_at_once [FOLDER]
+"""Coverage of the intervals on simulated scenes: python bench_coverage.py built_on|built_on_too|looked_at_once [FOLDER]
 
 For each scene the numbers of the truth's voxels, by the same code, and whether the intervals hold them. FOLDER keeps
 the volumes.
@@ -11,7 +11,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from grain_scenes import BUILT_ON, F32, LOOKED_AT_ONCE, Scene
+from grain_scenes import BUILT_ON, BUILT_ON_TOO, F32, LOOKED_AT_ONCE, Scene
 
 import recon
 from splatline_structure.intervals import found_in
@@ -47,7 +47,7 @@ def volumes_of(scene: Scene, keep: Path | None = None) -> dict[str, F32]:
 
 
 def main(which: str, folder: Path | None) -> None:
-    scenes = {"built_on": BUILT_ON, "looked_at_once": LOOKED_AT_ONCE}[which]
+    scenes = {"built_on": BUILT_ON, "built_on_too": BUILT_ON_TOO, "looked_at_once": LOOKED_AT_ONCE}[which]
     held: dict[str, list[bool]] = {name: [] for name in SHOWN}
     widths: dict[str, list[float]] = {name: [] for name in SHOWN}
     for number, scene in enumerate(scenes):

@@ -1,5 +1,5 @@
-"""Twenty scenes with a truth: grains packed in a matrix, and the simulator's cathode; ten to build on, ten to look at
-once.
+"""Thirty scenes with a truth: grains packed in a matrix, and the simulator's cathode; twenty to build on, ten to look
+at once.
 """
 
 from __future__ import annotations
@@ -115,4 +115,4 @@ def _scenes(first: int) -> tuple[Scene, ...]:
     )  # fmt: skip
 
 
-BUILT_ON, LOOKED_AT_ONCE = _scenes(100), _scenes(200)
+BUILT_ON, BUILT_ON_TOO, LOOKED_AT_ONCE = _scenes(100), _scenes(200), _scenes(300)

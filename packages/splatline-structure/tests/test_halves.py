@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from grain_scenes import Scene
 
-from splatline_structure import pictures
+from beamline import api
+from splatline_structure import pictures, volumes
+from splatline_structure.volumes import box_in
 from tests.beamline.cli.small_scan import beamline, left
 
 SCENE = Scene(5, views=64, size=14, columns=48, rows=16, photons=1e5)
@@ -57,7 +59,14 @@ def test_halves_of_a_scan_without_pixel_size_are_in_the_volumes_unit(here: Path)
 
 
 @pytest.mark.slow
-def test_intervals_against_views_are_wider_for_fewer(here: Path) -> None:
+def test_intervals_against_views_are_wider_for_fewer_in_one_box_about_one_axis(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    boxes, axes, reconstruct = [], [], api.reconstruct
+    monkeypatch.setattr(volumes, "box_in", lambda volume, crop: boxes.append(box_in(volume, crop)) or boxes[0])
+    monkeypatch.setattr(
+        api, "reconstruct", lambda *at, **of: axes.append(of["selection"].axis_col) or reconstruct(*at, **of)
+    )
     words = ("-m", "fbp", "--number", "fraction_2", "--number", "surface")
     result = beamline("structure-study", "scan.h5", "--views", "16,64", *words)
     assert result.exit_code == 0, result.output
@@ -69,6 +78,18 @@ def test_intervals_against_views_are_wider_for_fewer(here: Path) -> None:
     few, all_ = rows[1], rows[3]
     assert few["value"] == "not determined" or float(few["views"]) > float(all_["views"])
     assert (here / "scan_views/report.html").is_file()
+    assert len(boxes) == 1 and axes[0] is None and axes[1] == pytest.approx(23.5, abs=0.2)
+
+
+def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(api, "reconstruct", None)
+    result = beamline("structure-study", "scan.h5", "--views", "16,64", "--number", "fraction_3")
+    assert (
+        result.exit_code == 2 and "--number fraction_3: expected one of fraction_1, fraction_2, surf" in result.stderr
+    )
+    assert "tortuosity_x." in result.stderr and left(here) == {"scan.h5"}
 
 
 @pytest.mark.parametrize(("views", "words"), [("8,64", "16 views or more"), ("many", "invalid literal")])

@@ -51,7 +51,8 @@ def test_a_volume_gets_a_folder_of_numbers_particles_labels_and_a_page(here: Pat
     rows = {row["number"]: row for row in _rows(here / "can_structure/numbers.csv")}
     size = rows["size_50"]
     assert float(size["low"]) < float(size["value"]) < float(size["high"]) and size["unit"] == "µm"
-    assert size["decides"] in (
+    assert size["decides"] == "more whole particles would narrow this: a larger field"  # of six balls
+    assert rows["fraction_2"]["decides"] in (
         "the threshold decides this, not the views",
         "the size of a voxel decides this, not the views",
     )
