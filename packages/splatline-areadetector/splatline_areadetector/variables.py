@@ -16,7 +16,7 @@ from typing import Any, Self
 
 from beamline.core.errors import ConfigError
 from drivers.base.errors import DeviceTimeout
-from splatline_areadetector.subscribed import Subscribed
+from splatline_areadetector.receiver import Subscribed
 
 Value = float | str
 _ANSWER, _OTHERS = 3.0, 1.5  # s, for variables that are needed, and for others

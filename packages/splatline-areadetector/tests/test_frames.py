@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import time
+import io
+import json
 from typing import Any
 
 import h5py
@@ -14,7 +15,7 @@ from fake_ioc import FakeIoc, array_value, counts_of
 from beamline.core.errors import ConfigError
 from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError, Window, array_frame
 from splatline_areadetector.codecs import decoded
-from splatline_areadetector.receiver import HEAD, Places, Receiver
+from splatline_areadetector.receiver import Receiver, frame_of
 from splatline_areadetector.stream import Died, FrameStream, Item, Overflow, Queues, Refused, image_problem
 
 SMOOTH = np.arange(256 * 128).reshape(256, 128) // 300
@@ -126,22 +127,38 @@ def test_a_stream_marks_what_was_there_and_survives_what_it_cannot_read() -> Non
 
 def test_an_update_that_cannot_be_read_ends_nothing() -> None:
     """An exception in p4p's callback would end the subscription with a line in a log."""
-    said = list[list[Any]]()
-    receiver = Receiver(bytearray(10_000), said.append)
+    receiver, passed = Receiver(10_000), io.BytesIO()
     for value in (object(), array_value(counts_of(2), 2)):
         receiver.take(value)
-    refused, _, (_, facts) = said
-    assert refused[0] == "refused" and "AttributeError" in refused[2] and facts["unique_id"] == 2
+    for _ in range(3):
+        receiver.pass_on(passed)
+    passed.seek(0)
+    refused, ready = (json.loads(passed.readline()) for _ in range(2))
+    assert refused[0] == "refused" and "AttributeError" in refused[2] and ready == ["ready"]
+    frame = frame_of(passed, json.loads(passed.readline())[1])
+    assert frame.unique_id == 2 and np.array_equal(frame.counts(), counts_of(2))
 
 
-def test_places_are_used_again_when_they_are_free_and_for_frames_of_another_size_too() -> None:
-    memory = bytearray(5 * HEAD)
-    places = Places(memory)
-    assert [places.take(HEAD), places.take(HEAD - 1), places.take(HEAD)] == [0, 2 * HEAD, None]
-    memory[0] = 0
-    assert places.take(3 * HEAD) is None and places.take(HEAD) is None  # the second frame is still held
-    memory[2 * HEAD] = 0
-    assert places.take(3 * HEAD) == 0
+def test_frames_wait_up_to_a_limit_and_one_always_may() -> None:
+    size = counts_of(1).nbytes
+    for room, ids in ((2 * size, [1, 2]), (1, [1])):
+        receiver, passed = Receiver(room), io.BytesIO()
+        for unique_id in range(1, 5):
+            receiver.take(array_value(counts_of(unique_id), unique_id))
+        for _ in range(5):
+            receiver.pass_on(passed)
+        receiver.take(array_value(counts_of(5), 5))  # there is room again
+        receiver.pass_on(passed)
+        passed.seek(0)
+        told = list[tuple[str, int]]()
+        while line := passed.readline():
+            what, *facts = json.loads(line)
+            if what == "frame":
+                told.append((what, frame_of(passed, facts[0]).unique_id))
+            elif what == "overflow":
+                told.append((what, facts[0]))
+        lost = [("overflow", i) for i in range(len(ids) + 1, 5)]
+        assert told == [*(("frame", i) for i in ids), *lost, ("frame", 5)]
 
 
 @pytest.mark.usefixtures("loopback")
@@ -160,20 +177,18 @@ def test_a_receiver_that_dies_is_replaced_and_frames_that_are_held_stay(loopback
 
 
 @pytest.mark.usefixtures("loopback")
-def test_a_ring_without_room_for_two_frames_is_refused() -> None:
-    """The ride would wait for its first frame for ever."""
-    with FakeIoc() as ioc, pytest.raises(ConfigError, match=r"ring_mb is 0\.001, .* no room for two frames of 768 B"):
-        FrameStream(ioc.url, Queues(ring_megabytes=0.001))
-
-
-@pytest.mark.usefixtures("loopback")
-def test_a_full_ring_names_what_it_had_no_room_for_and_several_clients_lose_nothing() -> None:
-    small = Queues(ring_megabytes=3 * (counts_of(1).nbytes + 2 * HEAD) / 1e6)
-    with FakeIoc() as ioc, FrameStream(ioc.url) as whole, FrameStream(ioc.url, small) as stream:
-        time.sleep(0.2)
-        ioc.send(range(1, 7), 0.02)
-        time.sleep(0.3)
-        ids = [item.unique_id for item in _taken(whole, 7) if isinstance(item, ArrayFrame) and not item.is_current]
-        items = _taken(stream, 7)
-    assert ids == [*range(1, 7)]
-    assert [item.unique_id for item in items if isinstance(item, Overflow)] == [3, 4, 5, 6]  # beside the old frame
+def test_several_clients_lose_nothing_and_what_had_no_room_is_named() -> None:
+    """Frames of 2 MB, of which one waits beside those in this process and in the pipe."""
+    frames = [np.full((1024, 1024), i, np.uint16) for i in range(1, 13)]
+    with FakeIoc() as ioc, FrameStream(ioc.url) as whole, FrameStream(ioc.url, Queues(ring_megabytes=2.5)) as stream:
+        ids = list[int]()
+        for unique_id, counts in enumerate(frames, 1):
+            ioc.post(array_value(counts, unique_id))
+            while unique_id not in ids:  # it has been received by the one, and so posted to the other
+                ids += [item.unique_id for item in _taken(whole, 1) if isinstance(item, ArrayFrame)]
+        items = _taken(stream, 1)
+        while items[-1] != Overflow(12):
+            items += _taken(stream, 1)
+    assert [i for i in ids if i] == [*range(1, 13)]
+    numbers = [item.unique_id for item in items if isinstance(item, ArrayFrame | Overflow)]
+    assert [i for i in numbers if i] == [*range(1, 13)] and isinstance(items[1], ArrayFrame)
