@@ -8,7 +8,6 @@ with its stdin.
 from __future__ import annotations
 
 import json
-import math
 import os
 import queue
 import sys

@@ -13,8 +13,7 @@ import pytest
 from fake_ioc import FakeIoc, array_value, counts_of
 
 from beamline.core.errors import ConfigError
-from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError, Window, array_frame
-from splatline_areadetector.codecs import decoded
+from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError, Window, array_frame, decoded
 from splatline_areadetector.receiver import Receiver, frame_of
 from splatline_areadetector.stream import Died, FrameStream, Item, Overflow, Queues, Refused, image_problem
 
@@ -68,7 +67,7 @@ def test_window_and_attributes() -> None:
     value.dimension = [{"size": n, "offset": o, "fullSize": n, "binning": b, "reverse": r} for n, o, b, r in sides]
     frame = array_frame(value, 5.0)
     assert frame is not None and frame.window == Window((16, 24), (10, 6), (2, 2), (False, True))
-    assert (frame.unique_id, frame.time, frame.received) == (4, pytest.approx(1.7e9 + 0.25), 5.0)
+    assert (frame.unique_id, frame.received) == (4, 5.0) and frame.time == pytest.approx(1.7e9 + 0.25)
     assert frame.attributes == {"ColorMode": 0, "SampleRotary": 12.5}
     assert np.array_equal(frame.counts(), counts_of(4))
 

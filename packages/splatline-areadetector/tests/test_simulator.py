@@ -11,7 +11,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import h5py
 import numpy as np
@@ -100,7 +100,7 @@ class Ride:
         return code
 
 
-def _views(n: int) -> dict[str, object]:
+def _views(n: int) -> dict[str, Any]:
     return {"angles": {"from": "plan", "views": n, "start_deg": 0, "step_deg": 2}}
 
 
