@@ -76,7 +76,8 @@ DRIVERS: Mapping[str, DriverLabels] = {
         fire="HamaFireTrigger", counted=False,
     ),
     "eiger": DriverLabels(
-        _labelled("TriggerMode", "Internal Series", "External Series", "Internal Series"), modes=None, train="NumTriggers",
+        _labelled("TriggerMode", "Internal Series", "External Series", "Internal Series"),
+        modes=None, train="NumTriggers",
     ),
 }  # fmt: skip
 """By the name that a configuration gives the driver."""

@@ -1,5 +1,5 @@
-"""Counters: what the IOC's plugin and camera tell of a stream: whose loss a frame was that did not come, why none comes,
-and what makes a stream unfit, each in a sentence that says what to change."""
+"""Counters: what the IOC's plugin and camera tell of a stream: whose loss a frame was, why none comes, and what makes
+it unfit, each in a sentence that says what to change."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""Servers of EPICS: frames as areaDetector's NDPluginPva publishes them (NTNDArray) with how many each client missed, and
-the records of a published detector, by Channel Access and PVAccess, in a soft IOC (softioc)."""
+"""Servers of EPICS: frames as areaDetector's NDPluginPva publishes them (NTNDArray), with how many each client missed,
+and the records of a published detector, by Channel Access and PVAccess, in a soft IOC (softioc)."""
 
 from __future__ import annotations
 

@@ -194,4 +194,9 @@ def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
         ]
 
     subscriptions = asyncio.run_coroutine_threadsafe(start(), _loop()).result()
-    return lambda: [_loop().call_soon_threadsafe(each.close) for each in subscriptions] and None
+
+    def close() -> None:
+        for each in subscriptions:
+            _loop().call_soon_threadsafe(each.close)
+
+    return close
