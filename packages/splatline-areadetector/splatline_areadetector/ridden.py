@@ -89,7 +89,7 @@ class RiddenFrames:
         self._row = self._views = 0
         self._silence = Silence(
             ride.stream, ride.counters, ride.config.ride.silence_s, self._warn,
-            lambda: f"What came before is in the file.{self._told()}",
+            lambda: f"What came before is in the file.{self._told(ended=False)}",
         )  # fmt: skip
 
     @property
@@ -163,6 +163,8 @@ class RiddenFrames:
             return None
         before, self._last, self._gone = self._last, frame, False
         if isinstance(place, Outside):
+            if place.skipped and before is not None:
+                self._add_gap(range(before.unique_id + 1, before.unique_id + 1 + len(place.skipped)), before, frame)
             self._end_block()
             if not (place.repeated or self._told_of_outside):
                 self._told_of_outside = True
@@ -171,9 +173,7 @@ class RiddenFrames:
         if place.block != self._block:
             place = self._begin_block(place, frame)
         if place.skipped and before is not None:
-            still = self._stream.stood_still(before.time, frame.time)
-            ids = range(frame.unique_id - len(place.skipped), frame.unique_id)
-            self._gaps.append(Gap(ids, before.time, frame.time, still))
+            self._add_gap(range(frame.unique_id - len(place.skipped), frame.unique_id), before, frame)
         try:
             counts = frame.counts()
         except ValueError as error:
@@ -181,6 +181,10 @@ class RiddenFrames:
             self._warn(f"Frame {frame.unique_id}: {error}. It counts as missing.")
             return None
         return self._frame(frame, counts, place)
+
+    def _add_gap(self, ids: range, before: ArrayFrame, after: ArrayFrame) -> None:
+        still = self._stream.stood_still(before.time, after.time)
+        self._gaps.append(Gap(ids, before.time, after.time, still))
 
     def _place(self, frame: ArrayFrame) -> Place | Outside | NewEpoch:
         if self._last is not None and frame.kind != self._last.kind:
@@ -256,8 +260,12 @@ class RiddenFrames:
         self._told_pause = reason
         self._measurement.pause.resume()
 
-    def _told(self) -> str:
-        """Sentences on what is missing and whose loss it was, each after a space."""
+    def _told(self, *, ended: bool) -> str:
+        """Sentences on what is missing and whose loss it was, each after a space.
+
+        Args:
+            ended: the scan did, by itself.
+        """
         words = []
         for i, block in enumerate(self._plan.blocks):
             if missing := self._sorter.missing(i):
@@ -267,7 +275,7 @@ class RiddenFrames:
                     first, last = (math.degrees(angles[missing[end]]) for end in (0, -1))
                     at = f" (from {first:.4g}° to {last:.4g}°)"
                 words.append(f"{len(missing)} of {block.n} {noun}s are missing: {spans(missing)}{at}.")
-                if at and missing[0] == block.n - len(missing) and not (self._stop.stopping or self._epoch):
+                if at and missing[0] == block.n - len(missing) and ended:
                     words.append(self._first_or_last(missing))
         words += losses_told(self._gaps, self._overflowed, self._ride.counters)
         if self._sorter.repeats:
@@ -289,7 +297,8 @@ class RiddenFrames:
         )
 
     def _raise_outcome(self) -> None:
-        told, planned = self._told(), self._plan.angles.size
+        ended = not (self._stop.stopping or self._epoch)
+        told, planned = self._told(ended=ended), self._plan.angles.size
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{told}")
         if self._stop.stopping and not self._sorter.complete:
