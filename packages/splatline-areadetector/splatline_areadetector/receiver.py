@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,7 +123,7 @@ class Receiver:
             payload=frame.payload,
         )
 
-    def pass_on(self, stream: BinaryIO) -> None:
+    def pass_on(self, stream: IO[bytes]) -> None:
         """Write the next item; waits for one."""
         facts, payload = self._items.get()
         stream.write(json.dumps(facts, default=str, allow_nan=True).encode() + b"\n")
@@ -133,7 +133,7 @@ class Receiver:
         stream.flush()
 
 
-def frame_of(stream: BinaryIO, facts: dict[str, Any]) -> ArrayFrame:
+def frame_of(stream: IO[bytes], facts: dict[str, Any]) -> ArrayFrame:
     """The frame of which a receiver has written these facts, with its pixels, which follow in the stream."""
     dtype, n_pixels = facts["payload"]
     payload = np.empty(n_pixels, dtype)

@@ -32,8 +32,8 @@ class Tomoscan(PVGroup):  # type: ignore[misc]  # caproto has no types
     FlatExposureTime = pvproperty(value=0.01)
     DifferentFlatExposure = _choice("Different", ["Same", "Different"])
 
-    @RotationStart.startup
-    async def RotationStart(self, instance: Any, library: Any) -> None:  # type: ignore[no-redef]  # noqa: N802
+    @RotationStart.startup  # type: ignore[no-redef]
+    async def RotationStart(self, instance: Any, library: Any) -> None:  # noqa: N802
         while line := await asyncio.get_running_loop().run_in_executor(None, sys.stdin.readline):
             name, _, value = line.strip().partition("=")
             given: Any = value
