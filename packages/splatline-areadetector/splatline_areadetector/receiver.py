@@ -124,13 +124,19 @@ class Receiver:
         )
 
     def pass_on(self, stream: IO[bytes]) -> None:
-        """Write the next item; waits for one."""
+        """Write the next item; waits for one.
+
+        Args:
+            stream: without a buffer: Python's (3.11) loses bytes where the process is stopped while it waits to write.
+        """
         facts, payload = self._items.get()
-        stream.write(json.dumps(facts, default=str, allow_nan=True).encode() + b"\n")
+        parts = [json.dumps(facts, default=str, allow_nan=True).encode() + b"\n"]
         if payload is not None:
-            stream.write(np.ascontiguousarray(payload).data.cast("B"))
+            parts.append(np.ascontiguousarray(payload).data.cast("B"))
             self._passed += payload.nbytes
-        stream.flush()
+        for part in map(memoryview, parts):
+            while part:
+                part = part[stream.write(part) :]
 
 
 def frame_of(stream: IO[bytes], facts: dict[str, Any]) -> ArrayFrame:
@@ -163,8 +169,9 @@ def main(name: str, n_frames: str, room: str) -> None:
     receiver = Receiver(int(room))
 
     def pass_on() -> None:
-        while True:
-            receiver.pass_on(sys.stdout.buffer)
+        with open(1, "wb", buffering=0) as stream:
+            while True:
+                receiver.pass_on(stream)
 
     for work in (pass_on, lambda: _watch_clock(receiver.say)):
         threading.Thread(target=work, daemon=True).start()

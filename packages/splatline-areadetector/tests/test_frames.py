@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import signal
+import sys
+import time
 from typing import Any
 
 import h5py
@@ -177,17 +180,22 @@ def test_a_receiver_that_dies_is_replaced_and_frames_that_are_held_stay(loopback
 
 @pytest.mark.usefixtures("loopback")
 def test_several_clients_lose_nothing_and_what_had_no_room_is_named() -> None:
-    """Frames of 2 MB, of which one waits beside those in this process and in the pipe."""
-    frames = [np.full((1024, 1024), i, np.uint16) for i in range(1, 13)]
+    """Frames of 2 MB. Of the one client all wait, and keep their pixels, although its receiver is stopped for a moment;
+    of the other one does, beside those in the pipe and in this process."""
+    frames = [np.full((1024, 1024), i, np.uint16) for i in range(1, 31)]
     with FakeIoc() as ioc, FrameStream(ioc.url) as whole, FrameStream(ioc.url, Queues(ring_megabytes=2.5)) as stream:
-        ids = list[int]()
         for unique_id, counts in enumerate(frames, 1):
             ioc.post(array_value(counts, unique_id))
-            while unique_id not in ids:  # it has been received by the one, and so posted to the other
-                ids += [item.unique_id for item in _taken(whole, 1) if isinstance(item, ArrayFrame)]
+            time.sleep(0.02)
+            if unique_id == 20 and sys.platform != "win32":  # it waits to write then
+                whole._process.send_signal(signal.SIGSTOP)
+                time.sleep(0.1)
+                whole._process.send_signal(signal.SIGCONT)
+        come = [item for item in _taken(whole, 31) if isinstance(item, ArrayFrame) and not item.is_current]
         items = _taken(stream, 1)
-        while items[-1] != Overflow(12):
+        while items[-1] != Overflow(30):
             items += _taken(stream, 1)
-    assert [i for i in ids if i] == [*range(1, 13)]
+    assert [frame.unique_id for frame in come] == [*range(1, 31)]
+    assert all((frame.counts() == frame.unique_id).all() for frame in come)
     numbers = [item.unique_id for item in items if isinstance(item, ArrayFrame | Overflow)]
-    assert [i for i in numbers if i] == [*range(1, 13)] and isinstance(items[1], ArrayFrame)
+    assert [i for i in numbers if i] == [*range(1, 31)] and isinstance(items[1], ArrayFrame)
