@@ -130,13 +130,14 @@ class Receiver:
             stream: without a buffer: Python's (3.11) loses bytes where the process is stopped while it waits to write.
         """
         facts, payload = self._items.get()
-        parts = [json.dumps(facts, default=str, allow_nan=True).encode() + b"\n"]
+        parts: list[Any] = [json.dumps(facts, default=str, allow_nan=True).encode() + b"\n"]
         if payload is not None:
             parts.append(np.ascontiguousarray(payload).data.cast("B"))
             self._passed += payload.nbytes
-        for part in map(memoryview, parts):
-            while part:
-                part = part[stream.write(part) :]
+        for part in parts:
+            rest = memoryview(part)
+            while rest:
+                rest = rest[stream.write(rest) :]
 
 
 def frame_of(stream: IO[bytes], facts: dict[str, Any]) -> ArrayFrame:
