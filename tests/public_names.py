@@ -36,7 +36,7 @@ FOR_PACKAGES = {
         "AlarmError", "BeamlineError", "ConfigError", "DataError", "InstrumentError", "QualityError", "ScanStopped",
         "user_message",
     ),
-    "beamline.core.files": ("refuse_existing", "text_in", "atomic_file", "write_together", "write_whole"),
+    "beamline.core.files": ("parts_of", "refuse_existing", "text_in", "atomic_file", "write_together", "write_whole"),
     "beamline.core.text": ("count", "csv_text", "safe_name", "size", "spans"),
     "beamline.core.quantities": ("VoxelKind",),
     "beamline.core.events": ("BlockDone", "BlockStarted", "Sink", "StateEntered", "Warned", "json_of"),

@@ -16,8 +16,7 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraFrame, CameraSettings, CameraTiming, TriggerSource
 from recon.base.setting import setting
 from splatline_areadetector.arrays import ArrayFrame, FrameRefusedError
-from splatline_areadetector.camera_labels import DRIVERS, DriverLabels
-from splatline_areadetector.camera_records import LOOK_EVERY, Records
+from splatline_areadetector.camera_records import DRIVERS, LOOK_EVERY, DriverLabels, Records
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Item, Overflow, Queues, Refused
 
 _SETTLED = 0.2  # s for which no frame comes once a camera is stopped
@@ -304,31 +303,30 @@ class AreaDetectorCamera:
                     self._changed.notify_all()
 
     def _take(self, item: Item) -> None:
-        if isinstance(item, Overflow):
-            self._lost += 1
-            self._overrun += 1
-        elif isinstance(item, Refused):
-            self._problem = DeviceError(self.name, f"its frames cannot be taken: {item.why}", state="It is still armed")
-        elif isinstance(item, Died):
-            self._problem = DeviceError(
-                self.name, f"the process that receives its frames has ended ({item.code}), and another one is started",
-                state="Frames taken before are good",
-            )  # fmt: skip
-        elif isinstance(item, Disconnected):
-            self._problem = DeviceError(
-                self.name, "its IOC has gone", advice="Look whether it runs; it goes on when it is back",
-                state="Frames taken before are good",
-            )  # fmt: skip
-        elif not item.is_current:
-            self._take_frame(item)
+        match item:
+            case Overflow():
+                self._lost += 1
+                self._overrun += 1
+            case Refused(_, why):
+                self._fail(f"its frames cannot be taken: {why}")
+            case Died(code):
+                self._fail(f"the process that receives its frames has ended ({code}), and another one is started")
+            case Disconnected():
+                self._fail("its IOC has gone", "Look whether it runs; it goes on when it is back")
+            case ArrayFrame(is_current=False):
+                self._take_frame(item)
+
+    def _fail(self, problem: str, advice: str = "") -> None:
+        self._problem = DeviceError(
+            self.name, problem, advice=advice, state="It is still armed, and frames taken before are good"
+        )
 
     def _take_frame(self, item: ArrayFrame) -> None:
         shape = self.timing_of(self._own, self._settings).shape
         if item.window.shape != shape:
-            self._problem = DeviceError(
-                self.name, f"its frames are {item.window.shape[0]} x {item.window.shape[1]} pixels, and {shape[0]} x "
-                f"{shape[1]} were set", advice="Look which plugin Pva1:NDArrayPort names: one that bins or crops may "
-                "stand before it", state="It is still armed",
+            self._fail(
+                f"its frames are {item.window.shape[0]} x {item.window.shape[1]} pixels, and {shape[0]} x {shape[1]} "
+                "were set", "Look which plugin Pva1:NDArrayPort names: one that bins or crops may stand before it",
             )  # fmt: skip
             return
         if self._origin is None:
@@ -337,7 +335,7 @@ class AreaDetectorCamera:
         try:
             frame = CameraFrame(item.counts(), item.unique_id - self._origin, at)
         except ValueError as error:
-            self._problem = DeviceError(self.name, f"a frame is damaged: {error}", state="It is still armed")
+            self._fail(f"a frame is damaged: {error}")
             return
         if len(self._ring) >= self._ring_size:
             self._ring.popleft()

@@ -1,10 +1,86 @@
-"""Records: what the camera driver sets in its IOC, each read back until it is so."""
+"""Records of an IOC that the camera driver sets, and what drivers of areaDetector are told for each source of triggers.
+
+Labels, never indices: a driver's choices change with its camera. Sources: the templates of ADSpinnaker and ADGenICam,
+ADSimDetector, ADPcoWin, ADAndor3 and ADHamamatsuDCAM, eigerBase.template of ADEiger, and what tomoscan (APS) writes.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceRefused
+from drivers.base.protocols import TriggerSource
 from drivers.epics.channel import ProcessVariable, open_channel
+
+Writes = Mapping[str, str | float]
+_MODES: Mapping[TriggerSource, str] = {
+    TriggerSource.INTERNAL: "Multiple", TriggerSource.EXTERNAL: "Continuous", TriggerSource.SOFTWARE: "Continuous",
+}  # fmt: skip
+
+_SINGLE = {**_MODES, TriggerSource.SOFTWARE: "Single"}
+
+
+@dataclass(frozen=True)
+class DriverLabels:
+    """What a driver is told.
+
+    Attributes:
+        triggers: for each source that it has; {line}: as configured.
+        fire: the record that exposes a frame by software; "": each is an acquisition of one frame.
+        modes: ImageMode for each source; None: it has no such record.
+        counted: frames are numbered from 1 by ArrayCounter, which is set to 0 before; else by the camera, from its
+            first.
+        train: the record that takes the number of external triggers, each of one image; "": it needs none.
+        binning: a label of A3Binning, in place of BinX and BinY.
+        binned_region: SizeX and SizeY are in binned pixels.
+    """
+
+    triggers: Mapping[TriggerSource, Writes]
+    fire: str = ""
+    modes: Mapping[TriggerSource, str] | None = field(default_factory=lambda: MappingProxyType(_MODES))
+    counted: bool = True
+    train: str = ""
+    binning: str = ""
+    binned_region: bool = False
+
+
+def _labelled(
+    record: str, internal: str, external: str, software: str, **all_of: str
+) -> Mapping[TriggerSource, Writes]:
+    """A record with a label for each source, and others that are the same for all."""
+    labels = {TriggerSource.INTERNAL: internal, TriggerSource.EXTERNAL: external, TriggerSource.SOFTWARE: software}
+    return {source: {record: label, **all_of} for source, label in labels.items()}
+
+
+_WAITS: Writes = {"TriggerMode": "On", "TriggerOverlap": "ReadOut", "ExposureMode": "Timed", "FrameRateEnable": 0}
+_BY_GENICAM: Mapping[TriggerSource, Writes] = {
+    TriggerSource.INTERNAL: {"TriggerMode": "Off"},
+    TriggerSource.EXTERNAL: {"TriggerSource": "{line}", **_WAITS},
+    TriggerSource.SOFTWARE: {"TriggerSource": "Software", **_WAITS},
+}
+DRIVERS: Mapping[str, DriverLabels] = {
+    "spinnaker": DriverLabels(_BY_GENICAM, fire="TriggerSoftware", counted=False, binned_region=True),
+    "simdetector": DriverLabels(_labelled("TriggerMode", "Internal", "External", "Internal"), modes=_SINGLE),
+    "pco": DriverLabels(_labelled("TriggerMode", "Auto", "Ext Only", "Auto"), modes=_SINGLE),
+    "andor3": DriverLabels(
+        _labelled("TriggerMode", "Internal", "External", "Software"), fire="SoftwareTrigger",
+        modes={**_MODES, TriggerSource.INTERNAL: "Fixed"}, binning="{0}x{0}",
+    ),
+    "hamamatsu": DriverLabels(
+        _labelled(
+            "HamaTriggerSource", "Internal", "External", "Software", HamaTriggerMode="Normal", HamaTriggerActive="Edge"
+        ),
+        fire="HamaFireTrigger", counted=False,
+    ),
+    "eiger": DriverLabels(
+        _labelled("TriggerMode", "Internal Series", "External Series", "Internal Series"),
+        modes=None, train="NumTriggers",
+    ),
+}  # fmt: skip
+"""By the name that a configuration gives the driver."""
 
 LOOK_EVERY = 0.02  # s, for a readback
 

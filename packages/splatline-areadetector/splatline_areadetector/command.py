@@ -89,7 +89,8 @@ def _ride(
     repeat: bool,
     output: Path | None,
 ) -> list[RunResult]:
-    from splatline_areadetector.ride import Ride, opened, ride_scan
+    from splatline_areadetector.ridden import Ride
+    from splatline_areadetector.ride import opened, ride_scan
 
     stop, results = StopRequest(), []
     with ExitStack() as held:
@@ -102,7 +103,7 @@ def _ride(
         runs = output or Path(config.storage.folder)
         now = Ride(config, stream, guide, counters, given, runs, stop, terminal.say)  # type: ignore[arg-type]
         while True:
-            results += ride_scan(now, sinks, live=not no_live)
+            results.append(ride_scan(now, sinks, live=not no_live))
             if not repeat or stop.stopping:
                 return results
 

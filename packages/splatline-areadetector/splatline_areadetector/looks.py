@@ -8,8 +8,7 @@ from beamline.core.text import size, spans
 from drivers.base.clock import SystemClock
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig
-from splatline_areadetector.losses import Counters
-from splatline_areadetector.ridden import silence_told
+from splatline_areadetector.counters import Counters, silence_told
 from splatline_areadetector.ride import opened
 from splatline_areadetector.stream import FrameStream, Refused
 

@@ -16,7 +16,7 @@ from beamline.cli.options import say
 if TYPE_CHECKING:
     from splatline_areadetector.publish_detector import PublishedDetector
     from splatline_areadetector.publish_frames import RunFrames
-    from splatline_areadetector.publish_image import ImageServer
+    from splatline_areadetector.publish_servers import ImageServer
 
 _PREFIX = re.compile(r"[\w.\-:]{0,39}[\w.\-]:")
 _IDLE = 0.005  # s between two looks at the file
@@ -52,8 +52,7 @@ def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | 
     """
     from splatline_areadetector.publish_detector import PublishedDetector, records
     from splatline_areadetector.publish_frames import RunFrames
-    from splatline_areadetector.publish_image import ImageServer
-    from splatline_areadetector.publish_records import RecordServer
+    from splatline_areadetector.publish_servers import ImageServer, RecordServer
 
     name = f"{prefix}Pva1:Image"
     with closing(ImageServer(name, bind, port)) as image:

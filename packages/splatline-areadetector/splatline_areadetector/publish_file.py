@@ -11,7 +11,6 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from splatline_areadetector.publish_frames import PublishedFrame
-from splatline_areadetector.publish_image import attributes_of
 
 ATTRIBUTES = {
     "Angle": ("DOUBLE", "f8", "deg, of the stage at the trigger"),
@@ -80,7 +79,7 @@ class FrameFile:
             )
         seconds = int(frame.time)
         values = {
-            **attributes_of(frame), "NDArrayUniqueId": frame.unique_id, "NDArrayTimeStamp": frame.time,
+            **frame.attributes, "NDArrayUniqueId": frame.unique_id, "NDArrayTimeStamp": frame.time,
             "NDArrayEpicsTSSec": max(0, seconds - _EPICS_EPOCH),
             "NDArrayEpicsTSnSec": int(1e9 * (frame.time - seconds)),
         }  # fmt: skip

@@ -6,7 +6,6 @@ They are read from the file, which is written in any case. So no frame of the sc
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections import deque
 from collections.abc import Callable
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.files import parts_of
 from beamline.scan.runs import newest
 from beamline.storage.hdf5 import look_again, open_hdf5, readable
 from drivers.base.frame import FrameKind
@@ -33,6 +33,14 @@ _DATA, _KIND = "/entry/instrument/detector/data", "/entry/frame_log/kind"
 _ANGLE, _TIME = "/entry/sample/rotation_angle", "/entry/frame_log/time"
 _EXPOSURE, _COMMITTED = "/entry/instrument/detector/count_time", "/entry/progress/frames_committed"
 _COLUMNS = (_DATA, _KIND, _ANGLE, _TIME, _EXPOSURE)
+
+
+LOCATIONS = {
+    FrameKind.PROJECTION: "/exchange/data",
+    FrameKind.FLAT: "/exchange/data_white",
+    FrameKind.DARK: "/exchange/data_dark",
+}
+"""Kinds of frames as tomoscan (APS) writes them into the attribute HDF5FrameLocation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +61,17 @@ class PublishedFrame:
     angle: float
     time: float
     exposure: float
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """The NDAttributes of the frame by their names."""
+        return {
+            "ColorMode": 0,
+            "Angle": self.angle,
+            "Kind": self.kind.name.lower(),
+            "HDF5FrameLocation": LOCATIONS.get(self.kind, ""),
+            "AcquireTime": self.exposure,
+        }
 
 
 class Pace:
@@ -146,7 +165,7 @@ class RunFrames:
         """Open the file of the newest run, if it is another one."""
         self._looked = self._now()
         with suppress(ConfigError, DataError):  # no run, or a file that is just being made
-            run = _newest_part(newest(self._runs))
+            run = parts_of(newest(self._runs))[-1]
             if run == self.run:
                 return
             file = open_hdf5(run / "scan.h5", follow=True)
@@ -170,9 +189,3 @@ class RunFrames:
                 look_again(column)
         counts, kind, angle, at, exposure = (column[row] for column in self._columns)
         return PublishedFrame(counts, row + 1, FrameKind(int(kind)), float(angle), float(at), float(exposure))
-
-
-def _newest_part(run: Path) -> Path:
-    """The folder of the newest part of a run that was resumed, else of the run."""
-    numbers = [int(match[1]) for part in run.glob("part-*") if (match := re.fullmatch(r"part-(\d+)", part.name))]
-    return run / f"part-{max(numbers)}" if numbers else run

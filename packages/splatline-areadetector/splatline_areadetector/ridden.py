@@ -6,22 +6,24 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from beamline.core.errors import DataError, InstrumentError, ScanStopped
+from beamline.core.errors import DataError, ScanStopped
 from beamline.core.events import BlockDone, BlockStarted, StateEntered, Warned
-from beamline.core.stop import ScanAborted
+from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
 from beamline.scan.control import State
 from beamline.scan.ledger import LedgerError
 from beamline.scan.measurement import Measurement
 from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.arrays import ArrayFrame
+from splatline_areadetector.config import RideConfig
+from splatline_areadetector.counters import Counters, Gap, Silence, losses_told
 from splatline_areadetector.guides import EXPOSURE, Guide
-from splatline_areadetector.losses import Counters, Gap, losses_told
 from splatline_areadetector.plan import RidePlan
 from splatline_areadetector.sorter import NewEpoch, Outside, Place, Sorter
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
@@ -31,60 +33,70 @@ SETTLES = 0.2  # s in which the camera's counter comes here, after the frame tha
 SECOND = 1.0  # s to wait for a second projection before the first is given its angle
 _STATES = {FrameKind.DARK: State.DARKS, FrameKind.FLAT: State.FLATS, FrameKind.PROJECTION: State.ACQUIRING}
 
+_OTHERS = " Every other frame is in the file with the angle of its number."
+
 Images = Mapping[FrameKind, NDArray[Any]]
 """Darks and flats [frame, row, col] from files, where the scan takes none."""
 
 
 @dataclass(frozen=True, eq=False)
-class Journey:
-    """What a ride goes by: the stream, what tells of the scan, and what was known of it at its first frame.
+class Ride:
+    """What a ride goes by, connected.
 
     Attributes:
         counters: of plugin and camera.
-        given: darks and flats from files, which come first.
-        first_id: see `RideSection`.
-        silence: s without a frame, after which it is said why.
+        given: darks and flats from files, which come first, where the scan takes none.
+        runs: the folder in which each run gets its own.
+        say: takes what is said while there is no run.
     """
 
+    config: RideConfig
     stream: FrameStream
     guide: Guide
-    plan: RidePlan
     counters: Counters
     given: Images
-    first_id: int | None
-    silence: float
+    runs: Path
+    stop: StopRequest
+    say: Callable[[str], None]
+
+
+class EpochEndedError(LedgerError):
+    """The file has ended before the scan, as its frames' numbers began anew or their size changed."""
+
+
+def outside_told(guide: Guide) -> str:
+    """What is said of frames of no scan."""
+    status = f" ({guide.status})" if guide.status else ""
+    return f"Frames of no scan come{status}: they are not stored."
 
 
 class RiddenFrames:
-    """A `FrameSource`: takes frames from the stream until the scan is complete, its numbers begin anew, or a stop.
-
-    Attributes:
-        epoch: why the file ends before the scan, and another begins; "" where it does not.
-    """
+    """A `FrameSource`: takes frames from the stream until the scan is complete, its numbers begin anew, or a stop."""
 
     recovered, unsafe = 0, False
 
-    def __init__(self, journey: Journey, measurement: Measurement, now: Callable[[], float] = time.time) -> None:
-        self._by, self._measurement, self._now = journey, measurement, now
-        self._stream, self._guide, self._plan = journey.stream, journey.guide, journey.plan
+    def __init__(self, ride: Ride, plan: RidePlan, first_id: int | None, measurement: Measurement) -> None:
+        self._ride, self._plan, self._first_id, self._measurement = ride, plan, first_id, measurement
+        self._stream, self._guide = ride.stream, ride.guide
         self._sink, self._stop = measurement.sink, measurement.stop
-        self._sorter = Sorter(journey.plan.blocks, journey.first_id)
+        self._sorter = Sorter(plan.blocks, first_id)
         self._gaps: list[Gap] = []
         self._overflowed: set[int] = set()
-        self._kind: tuple[Any, ...] | None = None
         self._last: ArrayFrame | None = None
         self._block, self._block_kind, self._in_block = -1, "", 0
         self._gone = self._told_of_outside = False
-        self._told_pause = ""
+        self._told_pause = self._epoch = ""
         self._row = self._views = 0
-        self._came_at = time.monotonic()
-        self.epoch = ""
+        self._silence = Silence(
+            ride.stream, ride.counters, ride.config.ride.silence_s, self._warn,
+            lambda: f"What came before is in the file.{self._told(ended=False)}",
+        )  # fmt: skip
 
     @property
     def missing(self) -> list[int]:
-        first = sum(map(len, self._by.given.values()))
-        firsts = [first + each for each in self._plan.first_triggers]
-        return [firsts[i] + trigger for i in range(len(firsts)) for trigger in self._sorter.missing(i)]
+        given = sum(map(len, self._ride.given.values()))
+        firsts = enumerate(self._plan.first_triggers)
+        return [given + first + trigger for i, first in firsts for trigger in self._sorter.missing(i)]
 
     def frames(self) -> Generator[Frame, None, None]:
         """See `FrameSource`. LedgerError names the frames that are missing, and whose loss they are."""
@@ -94,27 +106,31 @@ class RiddenFrames:
         self._raise_outcome()
 
     def _from_files(self) -> Iterator[Frame]:
-        for kind, images in self._by.given.items():
+        for kind, images in self._ride.given.items():
             self._measurement.states.enter(_STATES[kind])
             for i, counts in enumerate(images):
-                seconds = self._plan.exposure(kind)
-                yield Frame(np.array(counts, np.uint16), kind, self._row, i, -1, math.nan, self._now(), seconds)
+                yield Frame(counts, kind, self._row, i, -1, math.nan, time.time(), self._plan.exposure(kind))
                 self._row += 1
 
     def _from_stream(self) -> Iterator[Frame]:
+        last = 0.0
         while not (self._sorter.complete or self._stop.aborting):
             self._refuse_pause()
-            item = self._stream.next(0.0 if self._stop.stopping else SLICE)
+            item = self._stream.next(SLICE)
+            if self._stop.stopping:  # what was on its way is still stored
+                last = last or time.time() + SLICE
+                if item is None or (isinstance(item, ArrayFrame) and item.received > last):
+                    return
             match item:
                 case None:
-                    if self._stop.stopping or self._is_over():
+                    if self._guide.ended(math.inf) and self._silence.lasted > SECOND:
                         return
-                    self._look_at_silence()
+                    self._silence.look()
                 case Disconnected():
                     self._gone = True
-                    self._sink(Warned(f"{self._stream.name}: its server has gone. The ride waits for it."))
+                    self._warn(f"{self._stream.name}: its server has gone. The ride waits for it.")
                 case Died(code):
-                    self._sink(Warned(f"The process that receives frames has ended ({code}): another one is started."))
+                    self._warn(f"The process that receives frames has ended ({code}): another one is started.")
                 case Overflow(unique_id):
                     self._overflowed.add(unique_id)
                     if (lost := self._sorter.pass_over(unique_id)) and self._last is not None:
@@ -125,54 +141,54 @@ class RiddenFrames:
                         "the file."
                     )
                 case ArrayFrame():
-                    if self._is_old(item):
-                        continue
+                    if item.is_current and (self._last is None or item.time <= self._last.time):
+                        continue  # the server still had it when it was connected
                     if frame := self._placed(item):
                         yield frame
                         self._row += 1
-                    if self.epoch or (self._in_block == 0 and self._guide.ended(item.time)):
+                    if self._epoch or (self._in_block == 0 and self._guide.ended(item.time)):
                         return
 
-    def _is_old(self, frame: ArrayFrame) -> bool:
-        """Whether it is what the server still had when it was connected."""
-        return frame.is_current and (self._last is None or frame.time <= self._last.time)
-
-    def _is_over(self) -> bool:
-        return self._guide.ended(math.inf) and time.monotonic() - self._came_at > SECOND
+    def _warn(self, sentence: str) -> None:
+        self._sink(Warned(sentence))
 
     def _placed(self, frame: ArrayFrame) -> Frame | None:
         """The frame of the file; None: it belongs to no scan, cannot be read, or to the next file."""
-        self._came_at = time.monotonic()
+        self._silence.frame_came()
         place = self._place(frame)
         if isinstance(place, NewEpoch):
-            self.epoch = place.why
-            self._sink(Warned(f"{place.why}: the file ends, another begins."))
+            self._epoch = place.why
+            self._warn(f"{place.why}: the file ends, another begins.")
             self._stream.put_back(frame)
             return None
         before, self._last, self._gone = self._last, frame, False
         if isinstance(place, Outside):
+            if place.skipped and before is not None:
+                self._add_gap(range(before.unique_id + 1, before.unique_id + 1 + len(place.skipped)), before, frame)
             self._end_block()
-            self._tell_of_outside(place)
+            if not (place.repeated or self._told_of_outside):
+                self._told_of_outside = True
+                self._sink(StateEntered(self._measurement.states.state, outside_told(self._guide)))
             return None
         if place.block != self._block:
             place = self._begin_block(place, frame)
         if place.skipped and before is not None:
-            still = self._stream.stood_still(before.time, frame.time)
-            ids = range(frame.unique_id - len(place.skipped), frame.unique_id)
-            self._gaps.append(Gap(ids, before.time, frame.time, still))
+            self._add_gap(range(frame.unique_id - len(place.skipped), frame.unique_id), before, frame)
         try:
             counts = frame.counts()
         except ValueError as error:
             self._sorter.lose(place)
-            self._sink(Warned(f"Frame {frame.unique_id}: {error}. It counts as missing."))
+            self._warn(f"Frame {frame.unique_id}: {error}. It counts as missing.")
             return None
         return self._frame(frame, counts, place)
 
+    def _add_gap(self, ids: range, before: ArrayFrame, after: ArrayFrame) -> None:
+        still = self._stream.stood_still(before.time, after.time)
+        self._gaps.append(Gap(ids, before.time, after.time, still))
+
     def _place(self, frame: ArrayFrame) -> Place | Outside | NewEpoch:
-        if self._kind is None:
-            self._kind = frame.kind
-        if frame.kind != self._kind:
-            (before, dtype), (after, other) = self._kind, frame.kind
+        if self._last is not None and frame.kind != self._last.kind:
+            (before, dtype), (after, other) = self._last.kind, frame.kind
             return NewEpoch(
                 f"frames are {after.shape[0]} x {after.shape[1]} {other} from number {frame.unique_id} on, after "
                 f"{before.shape[0]} x {before.shape[1]} {dtype}"
@@ -188,7 +204,7 @@ class RiddenFrames:
             if math.isnan(angle):
                 kind = FrameKind.INVALID
                 self._sorter.lose(place)
-                self._sink(Warned(f"Nothing tells the angle of frame {frame.unique_id}: it is kept as an invalid row."))
+                self._warn(f"Nothing tells the angle of frame {frame.unique_id}: it is kept as an invalid row.")
         exposure = frame.attributes.get(EXPOSURE)
         seconds = float(exposure) if isinstance(exposure, int | float) else self._plan.exposure(place.kind)
         self._in_block += 1
@@ -197,10 +213,10 @@ class RiddenFrames:
     def _begin_block(self, place: Place, frame: ArrayFrame) -> Place:
         self._end_block()
         self._block, kind = place.block, place.kind
-        if kind is FrameKind.PROJECTION and self._by.first_id is None and (lost := self._lost_before(frame)):
+        if kind is FrameKind.PROJECTION and self._first_id is None and (lost := self._lost_before(frame)):
             self._sorter.shift_first(lost)
             place = Place(place.block, kind, place.trigger + lost, range(lost))
-            self._sink(Warned(f"The camera had counted {count(lost, 'projection')} before the first that came."))
+            self._warn(f"The camera had counted {count(lost, 'projection')} before the first that came.")
         n = self._plan.blocks[place.block].n if place.block < len(self._plan.blocks) else 0
         self._block_kind = kind.name.lower()
         exposure, period = self._plan.exposure(kind), self._plan.period or 0.0
@@ -221,7 +237,7 @@ class RiddenFrames:
     def _lost_before(self, frame: ArrayFrame) -> int:
         """Projections that the camera had counted before this one, the first that came. It counts a frame about when it
         sends it, so it is asked between the first and the second one."""
-        camera = self._by.counters.camera
+        camera = self._ride.counters.camera
         if camera is None:
             return 0
         second = self._stream.next(SECOND)
@@ -237,34 +253,19 @@ class RiddenFrames:
         lost = int(float(values[-1])) - 1 if values else 0
         return lost if 0 < lost < self._plan.angles.size else 0
 
-    def _tell_of_outside(self, place: Outside) -> None:
-        if place.repeated or self._told_of_outside:
-            return
-        self._told_of_outside = True
-        status = f" ({self._guide.status})" if self._guide.status else ""
-        self._sink(StateEntered(self._measurement.states.state, f"Frames of no scan come{status}: they are not stored"))
-
     def _refuse_pause(self) -> None:
         reason = self._measurement.pause.reason
         if reason and reason != self._told_pause:
-            self._sink(Warned(f"The scan is another program's, and goes on: it should pause, as {reason}."))
+            self._warn(f"The scan is another program's, and goes on: it should pause, as {reason}.")
         self._told_pause = reason
         self._measurement.pause.resume()
 
-    def _look_at_silence(self) -> None:
-        if time.monotonic() - self._came_at < self._by.silence:
-            return
-        self._came_at = time.monotonic()  # said again after as long
-        if not self._stream.answers():
-            raise InstrumentError(
-                f"{self._stream.name}: no frame for {self._by.silence:g} s, and its server does not answer. What came "
-                f"before is in the file.{self._told()}"
-            )
-        why = silence_told(self._by.counters)
-        self._sink(Warned(f"No frame for {self._by.silence:g} s, the server answers: {why}."))
+    def _told(self, *, ended: bool) -> str:
+        """Sentences on what is missing and whose loss it was, each after a space.
 
-    def _told(self) -> str:
-        """Sentences on what is missing and whose loss it was, each after a space."""
+        Args:
+            ended: the scan did, by itself.
+        """
         words = []
         for i, block in enumerate(self._plan.blocks):
             if missing := self._sorter.missing(i):
@@ -274,9 +275,9 @@ class RiddenFrames:
                     first, last = (math.degrees(angles[missing[end]]) for end in (0, -1))
                     at = f" (from {first:.4g}° to {last:.4g}°)"
                 words.append(f"{len(missing)} of {block.n} {noun}s are missing: {spans(missing)}{at}.")
-                if at and missing[0] == block.n - len(missing) and not (self._stop.stopping or self.epoch):
+                if at and missing[0] == block.n - len(missing) and ended:
                     words.append(self._first_or_last(missing))
-        words += losses_told(self._gaps, self._overflowed, self._by.counters)
+        words += losses_told(self._gaps, self._overflowed, self._ride.counters)
         if self._sorter.repeats:
             words.append(f"{count(self._sorter.repeats, 'frame')} came twice and were stored once.")
         return "".join(f" {sentence}" for sentence in words if sentence)
@@ -286,7 +287,7 @@ class RiddenFrames:
 
         No view shows it: the same turn of all angles gives the same views of a turned sample.
         """
-        if self._by.counters.camera is not None or self._by.first_id is not None:
+        if self._ride.counters.camera is not None or self._first_id is not None:
             return ""
         angles, n = self._plan.angles, len(missing)
         return (
@@ -296,7 +297,8 @@ class RiddenFrames:
         )
 
     def _raise_outcome(self) -> None:
-        told, planned = self._told(), self._plan.angles.size
+        ended = not (self._stop.stopping or self._epoch)
+        told, planned = self._told(ended=ended), self._plan.angles.size
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{told}")
         if self._stop.stopping and not self._sorter.complete:
@@ -304,23 +306,7 @@ class RiddenFrames:
                 f"Stopped after {self._views} of {planned} projections: {self._stop.reason}. The file is complete as "
                 f"far as it goes.{told}"
             )
+        if self._epoch:
+            raise EpochEndedError(f"{told.strip()} The file ends there, as {self._epoch}.{_OTHERS}", self.missing)
         if self.missing:
-            epoch = f" The file ends there, as {self.epoch}." if self.epoch else ""
-            raise LedgerError(
-                f"{told.strip()}{epoch} Every other frame is in the file with the angle of its number.", self.missing
-            )
-
-
-def silence_told(counters: Counters) -> str:
-    """Why no frames may come, as far as the IOC tells, as a sentence's end."""
-    plugin, camera = counters.plugin, counters.camera
-    if plugin.text("EnableCallbacks_RBV") == "Disable":
-        return f"{plugin.prefix}EnableCallbacks is Disable; set it to Enable"
-    if camera is None:
-        return "the camera waits for triggers, or does not acquire (ride.camera would tell)"
-    if camera.text("ArrayCallbacks_RBV") == "Disable":
-        return f"{camera.prefix}ArrayCallbacks is Disable; set it to Enable"
-    state = camera.text("DetectorState_RBV")
-    if camera.text("Acquire_RBV") in ("Done", "0.0"):
-        return f"the camera does not acquire ({camera.prefix}Acquire is Done{f', {state}' if state else ''})"
-    return "the camera waits for triggers"
+            raise LedgerError(f"{told.strip()}{_OTHERS}", self.missing)

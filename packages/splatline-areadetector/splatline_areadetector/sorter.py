@@ -44,9 +44,11 @@ class Place:
 
 @dataclass(frozen=True)
 class Outside:
-    """A frame that is not stored: of no scan, beyond its block's plan, or seen before."""
+    """A frame that is not stored: of no scan, beyond its block's plan, or seen before; `skipped`: as of `Place`, at the
+    end of the block."""
 
     repeated: bool = False
+    skipped: range = range(0)
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,10 @@ class _Taken:
     first_id: int
     last_id: int
     triggers: set[int] = field(default_factory=set)
+
+    @property
+    def is_over(self) -> bool:
+        return self.last_id - self.first_id + 1 >= self.n
 
 
 class Sorter:
@@ -94,19 +100,19 @@ class Sorter:
         fell = False
         if current is not None and unique_id < current.last_id:
             fell = True
-            if reconnected or (phase.serial == self._serial and not self._is_over(current)):
+            if reconnected or (phase.serial == self._serial and not (self._closed or current.is_over)):
                 return NewEpoch(
                     f"frame numbers began anew at {unique_id}, after {current.last_id}: the server restarted, or its "
                     "counter was reset"
                 )
         if phase.kind is None:
-            return Outside()
+            return self._outside(unique_id)
         if phase.serial != self._serial or current is None:
             return self._begin(unique_id, phase)
         trigger = unique_id - current.first_id
-        if fell or trigger >= current.n or self._closed:
-            self._closed = True
-            return Outside()
+        if fell or self._closed or trigger >= current.n:
+            self._closed = self._closed or fell
+            return self._outside(unique_id)
         if unique_id == current.last_id:
             self.repeats += 1
             return Outside(repeated=True)
@@ -115,8 +121,14 @@ class Sorter:
         current.triggers.add(trigger)
         return Place(self._now, current.kind, trigger, skipped)
 
-    def _is_over(self, block: _Taken) -> bool:
-        return self._closed or block.last_id - block.first_id + 1 >= block.n
+    def _outside(self, unique_id: int) -> Outside:
+        """A frame that is not stored. By its number the present block may be over, whatever is missing at its end."""
+        current = self._taken.get(self._now)
+        if current is None or self._closed or unique_id < current.first_id + current.n:
+            return Outside()
+        skipped, self._closed = range(current.last_id + 1 - current.first_id, current.n), True
+        current.last_id = current.first_id + current.n - 1
+        return Outside(skipped=skipped)
 
     def _begin(self, unique_id: int, phase: Phase) -> Place | Outside:
         kind, first = phase.kind, unique_id
@@ -155,18 +167,9 @@ class Sorter:
         self._taken[place.block].triggers.discard(place.trigger)
 
     @property
-    def first_projection(self) -> int | None:
-        """The number of the first projection; None: none has come."""
-        return next((each.first_id for each in self._taken.values() if each.kind is FrameKind.PROJECTION), None)
-
-    @property
     def complete(self) -> bool:
-        """Whether the last frame of every planned block has come, so that no more frames are expected."""
-        return all(i in self._taken and self._reached(self._taken[i]) for i in range(len(self._planned)))
-
-    @staticmethod
-    def _reached(block: _Taken) -> bool:
-        return block.last_id - block.first_id + 1 >= block.n
+        """Whether every planned block has begun and the present one is over, so that no more frames are expected."""
+        return all(i in self._taken for i in range(len(self._planned))) and self._taken[self._now].is_over
 
     def missing(self, block: int) -> list[int]:
         """Triggers of a planned block that gave no frame."""

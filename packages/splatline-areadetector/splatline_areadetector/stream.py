@@ -1,7 +1,7 @@
-"""FrameStream: a subscription to an areaDetector's image over PVAccess, emptied at once into a ring of ours.
+"""FrameStream: a subscription to an areaDetector's image over PVAccess, emptied at once into memory of ours.
 
 The server keeps a queue for each client and overwrites its newest entry when it is full, without a word. So it is asked
-for about a second, and a process of its own (`receiver`) copies at once whatever it delivers. `pipeline=true` would
+for about a second, and a process of its own (`receiver`) takes at once whatever it delivers. `pipeline=true` would
 let the server wait for us, but today's servers of NDPluginPva then repeat frames. What is lost shows as a gap in the
 frames' numbers.
 """
@@ -10,30 +10,27 @@ from __future__ import annotations
 
 import json
 import math
-import mmap
 import os
 import subprocess
 import sys
 import threading
 import time
-import uuid
 from collections import deque
-from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Self
+from typing import IO, Any, Self
 
 from beamline.core.errors import BeamlineError, ConfigError
-from beamline.core.text import size
 from drivers.base.errors import DeviceTimeout
 from splatline_areadetector.arrays import ArrayFrame, array_frame
-from splatline_areadetector.receiver import HEAD, frame_of
+from splatline_areadetector.receiver import frame_of
 
 SCHEME = "pva://"
 _LEAST, _MOST = 4, 1000  # frames of the queue
 _USUAL = 100.0  # frames/s of a camera whose period is not known
 _STARTS, _AGAIN = 60.0, 0.5  # s for a receiver to start, and before another one is
+_AT_HAND = 4  # items that this process holds; all others wait in the receiver
+_PIPE = 2**20  # bytes
 ANSWERS_WITHIN = 3.0  # s
 UNREACHABLE = "Check the name, that its IOC runs, and which hosts are asked (EPICS_PVA_ADDR_LIST)"
 
@@ -103,9 +100,6 @@ def image_problem(url: str) -> str:
 class FrameStream:
     """The frames of a process variable, in the order in which they came, until `close`.
 
-    The pixels of a frame stay where the receiver put them, in a ring of memory that both processes share; a frame's
-    place is free again when nobody has its pixels any more.
-
     Args:
         url: pva://NAME.
         queues: see `Queues`.
@@ -119,8 +113,7 @@ class FrameStream:
         still: intervals of the Unix time during which no frame could be received.
 
     Raises:
-        ConfigError: the address is no pva://NAME, p4p is not installed, the variable is no NTNDArray, or there is too
-            little memory.
+        ConfigError: the address is no pva://NAME, p4p is not installed, or the variable is no NTNDArray.
         DeviceTimeout: no server answers.
         FrameRefusedError: its frames cannot be stored.
     """
@@ -141,12 +134,7 @@ class FrameStream:
             _refuse_other(self.name, value)
             self.first = array_frame(value, time.time(), is_current=True)
             self.queue = queues.frames(0 if self.first is None else self.first.n_bytes, period)
-            self._n_bytes, self._died_at = int(1e6 * queues.ring_megabytes), math.nan
-            if self.first is not None and self._n_bytes < 2 * (self.first.n_bytes + 2 * HEAD):
-                raise ConfigError(
-                    f"ring_mb is {queues.ring_megabytes:g}, which has no room for two frames of "
-                    f"{size(self.first.n_bytes)}: raise it. Nothing was started."
-                )
+            self._room, self._died_at = int(1e6 * queues.ring_megabytes), math.nan
             self._start()
             self._reader = threading.Thread(target=self._read, name=f"receives {self.name}", daemon=True)
             self._reader.start()
@@ -158,23 +146,18 @@ class FrameStream:
                 )
             self._close = opened.pop_all().close
 
-    @property
-    def waiting(self) -> int:
-        """Items in the ring."""
-        return len(self._items)
-
     def next(self, timeout: float) -> Item | None:
         """The next item; None: nothing came within the time (s)."""
         with self._changed:
             if not self._items and not self._changed.wait_for(lambda: self._items, timeout):
                 return None
+            self._changed.notify_all()
             return self._items.popleft()
 
     def put_back(self, item: Item) -> None:
         """Have `next` return this item again, before all others."""
         with self._changed:
             self._items.appendleft(item)
-            self._changed.notify()
 
     def answers(self) -> bool:
         """Whether the server answers now; waits 1.5 s at most."""
@@ -211,16 +194,20 @@ class FrameStream:
             raise ConfigError(f"{self.name} refuses to be read: {error}. Nothing was started.") from None
 
     def _start(self) -> None:
-        """Start a receiver, with new memory. Ctrl-C does not reach it, and it imports what this process does."""
-        self._memory, word, self._let_go = _shared_memory(self._n_bytes)
-        present = 0 if self.first is None else min(self.queue * self.first.n_bytes, self._n_bytes)
-        arguments = (self.name, f"{self.queue}", word, f"{self._n_bytes}", f"{present}")
+        """Start a receiver. Ctrl-C does not reach it, and it imports what this process does."""
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "splatline_areadetector.receiver", *arguments],
+            [
+                sys.executable,
+                "-P",
+                "-m",
+                "splatline_areadetector.receiver",
+                self.name,
+                f"{self.queue}",
+                f"{self._room}",
+            ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            text=True,
-            encoding="utf-8",
+            pipesize=_PIPE,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             start_new_session=True,
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
@@ -230,31 +217,30 @@ class FrameStream:
     def _end(self) -> None:
         self._over = True
         self._process.kill()
+        with self._changed:
+            self._changed.notify_all()
         self._reader.join()
-        self._let_go()
 
     def _read(self) -> None:
-        """Take what the receiver says, in a thread. Where it dies, another one is started."""
-        while True:
+        """Take what the receiver passes on, in a thread. Where it dies, another one is started."""
+        while not self._over:
             process = self._process
             assert process.stdin is not None and process.stdout is not None
-            with process.stdin, process.stdout as lines:
-                for line in lines:
-                    self._take(*json.loads(line))
+            with process.stdin, process.stdout as stream, suppress(EOFError, ValueError):  # it died within an item
+                while line := stream.readline():
+                    self._take(stream, *json.loads(line))
             code, self._died_at = process.wait(), time.time()
             if self._over or not self._ready.is_set():  # the constructor waits for the first, and raises
                 self._ready.set()
                 return
             self._put(Died(code))
             time.sleep(_AGAIN)
-            self._let_go()
             self._start()
 
-    def _take(self, what: str, *facts: Any) -> None:
-        """Take a line of the receiver."""
+    def _take(self, stream: IO[bytes], what: str, *facts: Any) -> None:
         match what:
             case "frame":
-                self._put(frame_of(self._memory, facts[0]))
+                self._put(frame_of(stream, facts[0]))
             case "refused":
                 self._put(Refused(*facts))
             case "overflow":
@@ -270,32 +256,9 @@ class FrameStream:
 
     def _put(self, item: Item) -> None:
         with self._changed:
+            self._changed.wait_for(lambda: len(self._items) < _AT_HAND or self._over)
             self._items.append(item)
-            self._changed.notify()
-
-
-def _shared_memory(n_bytes: int) -> tuple[mmap.mmap, str, Callable[[], None]]:
-    """Memory, given where it is used, the word by which a receiver opens it, and what ends that: the memory itself goes
-    with the last array in it. ConfigError: there is too little."""
-    try:
-        if sys.platform == "win32":
-            word = f"splatline-{uuid.uuid4()}"
-            return mmap.mmap(-1, n_bytes, tagname=word), word, lambda: None
-        handle = os.memfd_create("frames")
-        try:
-            os.ftruncate(handle, n_bytes)
-            memory = mmap.mmap(handle, n_bytes)
-        except BaseException:
-            os.close(handle)
-            raise
-        return memory, f"/proc/{os.getpid()}/fd/{handle}", partial(_closed_once, [handle])
-    except (OSError, ValueError, OverflowError) as error:
-        raise ConfigError(f"There is no memory of {size(n_bytes)} for frames ({error}): lower ring_mb.") from error
-
-
-def _closed_once(handles: list[int]) -> None:
-    while handles:
-        os.close(handles.pop())
+            self._changed.notify_all()
 
 
 def _refuse_other(name: str, value: Any) -> None:

@@ -12,11 +12,12 @@ import time
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import cache, partial
 from typing import Any, Self
 
 from beamline.core.errors import ConfigError
 from drivers.base.errors import DeviceTimeout
-from splatline_areadetector.subscribed import Subscribed
+from splatline_areadetector.receiver import Subscribed
 
 Value = float | str
 _ANSWER, _OTHERS = 3.0, 1.5  # s, for variables that are needed, and for others
@@ -100,7 +101,7 @@ class Variables:
         self._came = threading.Condition()
         subscribe = _over_pva if scheme == "pva" else _over_ca
         try:
-            self._close = subscribe({self.prefix + name: self._adder(name) for name in names})
+            self.close = subscribe({self.prefix + name: partial(self._add, name) for name in names})
         except ImportError as error:
             raise ConfigError(
                 f'{url} needs the library {error.name}: pip install "splatline[areadetector]". Nothing was started.'
@@ -122,13 +123,10 @@ class Variables:
     def _silent(self, names: Sequence[str]) -> list[str]:
         return [name for name in names if self.histories[name].last is None]
 
-    def _adder(self, name: str) -> Callable[[float, Value], None]:
-        def add(stamp: float, value: Value) -> None:
-            with self._came:
-                self.histories[name].add(stamp, value)
-                self._came.notify()
-
-        return add
+    def _add(self, name: str, stamp: float, value: Value) -> None:
+        with self._came:
+            self.histories[name].add(stamp, value)
+            self._came.notify()
 
     def number(self, name: str) -> float | None:
         """The present value as a number; None: not known."""
@@ -140,9 +138,6 @@ class Variables:
         """The present value as text; "": not known."""
         last = self.histories[name].last
         return "" if last is None else str(last)
-
-    def close(self) -> None:
-        self._close()
 
     def __enter__(self) -> Self:
         return self
@@ -162,50 +157,39 @@ def _plain(value: Any) -> Value:
 
 
 def _over_pva(adders: dict[str, Add]) -> Callable[[], None]:
-    def taking(add: Add) -> Callable[[Any], None]:
-        def take(update: Any) -> None:
-            if isinstance(update, Exception):
-                return
-            value, stamp = update.value, update.get("timeStamp")
-            choices = getattr(value, "choices", None)
-            seconds = 0.0 if stamp is None else stamp.secondsPastEpoch + 1e-9 * stamp.nanoseconds
-            add(seconds, choices[value.index] if choices else _plain(value))
+    def take(add: Add, update: Any) -> None:
+        if isinstance(update, Exception):
+            return
+        value, stamp = update.value, update.get("timeStamp")
+        choices = getattr(value, "choices", None)
+        seconds = 0.0 if stamp is None else stamp.secondsPastEpoch + 1e-9 * stamp.nanoseconds
+        add(seconds, choices[value.index] if choices else _plain(value))
 
-        return take
-
-    return Subscribed({name: taking(add) for name, add in adders.items()}).close
+    return Subscribed({name: partial(take, add) for name, add in adders.items()}).close
 
 
-_LOOP: list[asyncio.AbstractEventLoop] = []
-"""The event loop of Channel Access, in a thread of its own, once a process."""
-
-
+@cache
 def _loop() -> asyncio.AbstractEventLoop:
-    if not _LOOP:
-        _LOOP.append(asyncio.new_event_loop())
-        threading.Thread(target=_LOOP[0].run_forever, name="channel access", daemon=True).start()
-    return _LOOP[0]
+    """The event loop of Channel Access, in a thread of its own, once a process."""
+    loop = asyncio.new_event_loop()
+    threading.Thread(target=loop.run_forever, name="channel access", daemon=True).start()
+    return loop
 
 
 def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
     import aioca
 
-    def taking(name: str, add: Add) -> Callable[[Any], Any]:
-        labels: list[str] = []
-
-        async def take(update: Any) -> None:
-            if not update.ok:
-                return
-            if update.datatype == aioca.DBR_ENUM and not labels:  # which updates with a time leave out
-                labels.extend((await aioca.caget(name, format=aioca.FORMAT_CTRL)).enums)
-            is_label = update.datatype == aioca.DBR_ENUM and int(update) < len(labels)
-            add(float(update.timestamp), labels[int(update)] if is_label else _plain(update))
-
-        return take
+    async def take(add: Add, labels: list[str], update: Any) -> None:
+        if not update.ok:
+            return
+        is_choice = update.datatype == aioca.DBR_ENUM
+        if is_choice and not labels:  # which updates with a time leave out
+            labels.extend((await aioca.caget(update.name, format=aioca.FORMAT_CTRL)).enums)
+        add(float(update.timestamp), labels[int(update)] if is_choice and int(update) < len(labels) else _plain(update))
 
     async def start() -> list[Any]:
         return [
-            aioca.camonitor(name, taking(name, add), format=aioca.FORMAT_TIME, all_updates=True)
+            aioca.camonitor(name, partial(take, add, []), format=aioca.FORMAT_TIME, all_updates=True)
             for name, add in adders.items()
         ]
 

@@ -18,8 +18,7 @@ import numpy as np
 from drivers.base.frame import FrameKind
 from splatline_areadetector.publish_detector import Record, Sides, Value
 from splatline_areadetector.publish_frames import PublishedFrame
-from splatline_areadetector.publish_image import ImageServer
-from splatline_areadetector.publish_records import RecordServer
+from splatline_areadetector.publish_servers import ImageServer, RecordServer
 
 SENSOR, READOUT, DEAD = (256, 320), 0.003, 0.002  # pixels, s, s
 LATEST = 0.003  # s after readout by which the driver has a frame

@@ -41,16 +41,16 @@ def array_value(
     return value
 
 
-PLUGIN = {
+PLUGIN: dict[str, float | str] = {
     "Pva1:NDArrayPort_RBV": "CAM", "Pva1:EnableCallbacks_RBV": "Enable", "Pva1:MinCallbackTime_RBV": 0.0,
     "Pva1:DroppedArrays_RBV": 0.0, "Pva1:ArrayCounter_RBV": 0.0, "Pva1:QueueFree": 20.0,
 }  # fmt: skip
-CAMERA = {
+CAMERA: dict[str, float | str] = {
     "cam1:PortName_RBV": "CAM", "cam1:Acquire_RBV": "Done", "cam1:DetectorState_RBV": "Idle",
     "cam1:ArrayCallbacks_RBV": "Enable", "cam1:NumImagesCounter_RBV": 0.0, "cam1:ArrayCounter_RBV": 0.0,
     "cam1:AcquireTime_RBV": 0.02, "cam1:AcquirePeriod_RBV": 0.05, "cam1:BinX_RBV": 1.0, "cam1:BinY_RBV": 1.0,
 }  # fmt: skip
-TOMOSCAN = {
+TOMOSCAN: dict[str, float | str] = {
     "ScanStatus": "Scan complete", "FrameType": "Projection", "RotationStart": 10.0, "RotationStep": 0.5,
     "NumAngles": 8.0, "NumDarkFields": 3.0, "DarkFieldMode": "Start", "NumFlatFields": 4.0, "FlatFieldMode": "Both",
     "ExposureTime": 0.03, "FlatExposureTime": 0.01, "DifferentFlatExposure": "Different",

@@ -16,7 +16,7 @@ def _choice(first: str, labels: list[str]) -> Any:
     return pvproperty(value=first, dtype=ChannelType.ENUM, enum_strings=labels)
 
 
-class Tomoscan(PVGroup):
+class Tomoscan(PVGroup):  # type: ignore[misc]  # caproto has no types
     """As tomoscan.template: ScanStatus is an array of characters."""
 
     ScanStatus = pvproperty(value=b"Scan complete", dtype=ChannelType.CHAR, max_length=256)
@@ -32,7 +32,7 @@ class Tomoscan(PVGroup):
     FlatExposureTime = pvproperty(value=0.01)
     DifferentFlatExposure = _choice("Different", ["Same", "Different"])
 
-    @RotationStart.startup
+    @RotationStart.startup  # type: ignore[no-redef]
     async def RotationStart(self, instance: Any, library: Any) -> None:  # noqa: N802
         while line := await asyncio.get_running_loop().run_in_executor(None, sys.stdin.readline):
             name, _, value = line.strip().partition("=")

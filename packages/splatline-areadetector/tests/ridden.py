@@ -18,7 +18,8 @@ from beamline.config.load import load_as
 from beamline.core.events import Event, Warned
 from beamline.core.stop import StopRequest
 from splatline_areadetector.config import RideConfig
-from splatline_areadetector.ride import Ride, opened, ride_scan
+from splatline_areadetector.ridden import Ride
+from splatline_areadetector.ride import opened, ride_scan
 
 WITHIN = 20.0  # s, in which a ride ends after its scan
 PLAN = {"from": "plan", "views": 20, "start_deg": 0, "step_deg": 9}

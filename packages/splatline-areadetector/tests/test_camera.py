@@ -24,14 +24,14 @@ from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.testing.camera import CameraBench, CameraConformance
 from splatline_areadetector.camera import AreaDetectorCamera, AreaDetectorSettings
-from splatline_areadetector.camera_labels import DRIVERS
+from splatline_areadetector.camera_records import DRIVERS
 
 FAKE = Path(__file__).with_name("fake_camera.py")
 SETTINGS = AreaDetectorSettings(
     "pva://none:", "spinnaker", (256, 320), 0.003, 0.5, dead=0.002, ring=1_000_000, offset=100, timeout=5.0
 )
 EXTERNAL = CameraSettings(0.01, TriggerSource.EXTERNAL, (32, 64, 64, 96))
-REFUSED = [
+REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"exposure": 0.0}, "exposure of 0 s"),
     ({"roi": (224, 0, 64, 96)}, "beyond the sensor of 256 x 320"),
     ({"binning": 5}, "not divided by binning 5"),
@@ -64,8 +64,8 @@ class FakeIoc:
         self.tell(" ".join(f"{at:.6f}" for at in times))
 
     def camera(self, **changes: Any) -> AreaDetectorCamera:
-        own = replace(SETTINGS, prefix=f"pva://{self.prefix}", driver=self.driver)
-        return AreaDetectorCamera(replace(own, **changes), SystemClock())
+        own: dict[str, Any] = {"prefix": f"pva://{self.prefix}", "driver": self.driver, **changes}
+        return AreaDetectorCamera(replace(SETTINGS, **own), SystemClock())
 
     def close(self) -> None:
         self.process.kill()

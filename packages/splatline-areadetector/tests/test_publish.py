@@ -21,8 +21,7 @@ from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.publish_detector import PublishedDetector, Sides, Value, records
 from splatline_areadetector.publish_file import FrameFile
 from splatline_areadetector.publish_frames import Pace, PublishedFrame, RunFrames
-from splatline_areadetector.publish_image import ImageServer, attributes_of
-from splatline_areadetector.publish_records import RecordServer
+from splatline_areadetector.publish_servers import ImageServer, RecordServer
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.scans import TwoCylinders, frames_of
 
@@ -156,7 +155,7 @@ def test_a_client_sees_pixels_number_and_attributes(image: ImageServer) -> None:
     ]  # fmt: skip
     assert value.timeStamp.secondsPastEpoch + 1e-9 * value.timeStamp.nanoseconds == FRAME.time
     assert value.dataTimeStamp.nanoseconds == 250_000_000
-    assert {each.name: each.value for each in value.attribute} == attributes_of(FRAME) == {
+    assert {each.name: each.value for each in value.attribute} == FRAME.attributes == {
         "ColorMode": 0, "Angle": 31.5, "Kind": "projection", "HDF5FrameLocation": "/exchange/data", "AcquireTime": 0.05,
     }  # fmt: skip
 

@@ -22,7 +22,7 @@ import pytest
 
 from drivers.base.frame import FrameKind
 from splatline_areadetector.publish_frames import PublishedFrame
-from splatline_areadetector.publish_image import ImageServer
+from splatline_areadetector.publish_servers import ImageServer
 
 HERE = Path(__file__).parent
 CLIENTS = ("ophyd_async", "pvaccess")  # not imported here: pvapy and p4p bring different libraries of EPICS

@@ -187,6 +187,20 @@ def test_lost_frames_are_named_with_whose_loss_it_was(tmp_path: Path) -> None:
     assert file.missing == [4, 5, 10, 14] and np.allclose(file.degrees, 9.0 * (file.ids - 1))
 
 
+def test_what_is_missing_at_the_end_ends_the_ride_once_the_camera_runs_free(tmp_path: Path) -> None:
+    def scan(stop: StopRequest) -> None:
+        ioc.send(range(1, 16))
+        ioc.put({"Pva1:DroppedArrays_RBV": 5.0})
+        ioc.send(range(21, 30), 0.05)
+
+    with FakeIoc() as ioc:
+        told = ride_along(config_of(tmp_path, ioc.url), tmp_path, scan)
+    assert isinstance(told.error, LedgerError) and "5 of 20 projections are missing: 15-19" in str(told.error)
+    assert "Frames 16-20 were lost by the plugin T:Pva1:, whose queue was full (DroppedArrays rose by 5)" in str(
+        told.error
+    )
+
+
 def test_a_lower_number_or_another_size_begins_another_file(tmp_path: Path) -> None:
     def scan(stop: StopRequest) -> None:
         ioc.send(range(50, 60))

@@ -11,7 +11,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import h5py
 import numpy as np
@@ -100,7 +100,7 @@ class Ride:
         return code
 
 
-def _views(n: int) -> dict[str, object]:
+def _views(n: int) -> dict[str, Any]:
     return {"angles": {"from": "plan", "views": n, "start_deg": 0, "step_deg": 2}}
 
 
@@ -263,21 +263,21 @@ def test_a_ride_that_is_killed_is_recovered(tmp_path: Path, scan: Path) -> None:
 
 @pytest.mark.bench
 def test_large_frames_for_a_minute(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
-    """2048 x 2048 x 16 bit at 10 a second, 84 MB/s: none lost. CPU and memory are recorded.
+    """2048 x 2048 x 16 bit at 10 a second, 84 MB/s: none lost, each equal to the bit. CPU and memory are recorded.
 
     It needs two free cores and a disk that keeps up.
     """
     n = MINUTE
+    noise = np.random.default_rng(0).integers(0, 2**16, (13, 2048, 2048), dtype=np.uint16)  # another one each time
     with h5py.File(tmp_path / "large.h5", "w") as file:
-        noise = np.random.default_rng(0).integers(900, 1100, (4, 2048, 2048))
-        file["/exchange/data"] = noise.astype(np.uint16)
+        file["/exchange/data"] = noise
     with served(tmp_path / "large.h5", 10, n / 10 + 4, 45):
         ride = Ride(tmp_path, "--no-live", period_s=0.1, **_views(n))
         process, most, cpu = psutil.Process(ride.process.pid), 0.0, 0.0
         while ride.process.poll() is None:
             try:
                 family = [process, *process.children()]
-                most = max(most, process.memory_info().rss / 1e9)  # the receiver has the same frames in memory
+                most = max(most, sum(each.memory_info().rss for each in family) / 1e9)
                 cpu = max(cpu, sum(sum(each.cpu_times()[:2]) for each in family))
             except psutil.Error:
                 break
@@ -288,8 +288,6 @@ def test_large_frames_for_a_minute(tmp_path: Path, record_property: Callable[[st
     print(f"{n} frames of 8.4 MB: {cpu:.1f} s of CPU, {most:.2f} GB at most")
     (path,) = (tmp_path / "runs").glob("*/scan.h5")
     with h5py.File(path) as file:
-        ids = file["/entry/frame_log/framestamp"][()]
-        assert ids.tolist() == [*range(1, n + 1)], ride.output
-        rows = [0, n // 2, n - 1]
-        equal = [np.array_equal(file["/entry/instrument/detector/data"][row], noise[row % 4]) for row in rows]
-    assert code in (0, 7) and all(equal), ride.output
+        ids, counts = file["/entry/frame_log/framestamp"][()], file["/entry/instrument/detector/data"]
+        assert all(np.array_equal(counts[row], noise[(i - 1) % len(noise)]) for row, i in enumerate(ids))
+    assert ids.tolist() == [*range(1, n + 1)] and code in (0, 7), ride.output

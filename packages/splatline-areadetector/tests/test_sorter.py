@@ -31,7 +31,7 @@ def test_blocks_and_what_belongs_to_none() -> None:
     assert sorter.take(4, DARKS) == Outside(repeated=True) and sorter.repeats == 1
     assert sorter.take(5, DARKS) == Place(0, DARK, 1)
     assert sorter.take(6, DARKS) == Outside()  # beyond the block's plan: the camera runs free
-    assert sorter.take(8, VIEWS) == Place(1, VIEW, 0) and sorter.first_projection == 8
+    assert sorter.take(8, VIEWS) == Place(1, VIEW, 0)
     assert sorter.take(11, VIEWS) == Place(1, VIEW, 3, range(1, 3))
     assert sorter.take(12, VIEWS) == Place(1, VIEW, 4) and not sorter.complete
     assert sorter.take(1, FLATS) == Place(2, FLAT, 0)  # numbered anew in each block
@@ -55,6 +55,18 @@ def test_free_run_after_the_last_view_is_no_epoch() -> None:
     """A camera that counts from each start runs free before tomoscan says that its scan is complete."""
     sorter = Sorter([PlannedBlock(VIEW, 2)])
     assert [sorter.take(i, VIEWS) for i in (1, 2, 1, 2, 3)][2:] == [Outside()] * 3
+
+
+def test_frames_that_are_missing_at_the_end_are_known_once_later_ones_come() -> None:
+    """A ride by a plan would wait for them for ever."""
+    sorter = Sorter(BLOCKS[1:2])
+    assert sorter.take(1, VIEWS) == Place(0, VIEW, 0) and sorter.take(3, VIEWS) == Place(0, VIEW, 2, range(1, 2))
+    assert not sorter.complete and sorter.take(9, VIEWS) == Outside(skipped=range(3, 5))
+    assert sorter.complete and sorter.missing(0) == [1, 3, 4] and sorter.take(10, VIEWS) == Outside()
+    sorter = Sorter(BLOCKS)
+    places = [sorter.take(i, phase) for i, phase in ((1, DARKS), (3, VIEWS), (8, FLATS), (12, NO_SCAN))]
+    assert places[3] == Outside(skipped=range(1, 3)) and sorter.complete  # the last dark and view did not come
+    assert [sorter.missing(i) for i in range(3)] == [[1], [1, 2, 3, 4], [1, 2]]
 
 
 def test_the_first_projection_by_its_number_and_by_a_second_count() -> None:
