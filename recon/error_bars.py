@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from recon.base.arrays import F32, some_values
-from recon.base.decisions import Decisions
+from recon.base.decisions import MATERIALS, Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
@@ -20,6 +20,7 @@ from recon.splatting.fit_method import Fit
 from recon.voxels.direct import Fbp, direct
 from recon.voxels.iterative import VoxelMethod, Watch, solve_views
 from recon.voxels.methods import FistaTv, PnpDct
+from recon.voxels.priors import pulling
 from recon.voxels.projector import Projector
 
 HALO = 8  # Slices beside a slab, at least, that its error bars need
@@ -121,7 +122,8 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
         raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
     smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
     _, by_patches = decided.get("strength", [(0.0, 0)])[-1]
-    return patches if by_patches else smooth
+    levels, *_ = decided.get(MATERIALS, [((),)])[-1]
+    return pulling(allow_negative=method.allow_negative)[0] if levels else patches if by_patches else smooth
 
 
 def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:

@@ -14,7 +14,7 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Iterative
 from recon.base.volume import Grid
-from recon.splatting.finish import FINISH_SWEEPS, finish
+from recon.splatting.finish import FINISH_SWEEPS, finish, trial_sweeps
 from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import voxelize
@@ -84,10 +84,10 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
         return FinishPlan(0, 0.0)
     sweep = sweep_seconds(geometry, grid, now)
     before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
-    choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
+    choice = choice_sweeps(geometry) * sweep
     most, room = before + FINISH_SWEEPS * sweep, seconds
     if choice:  # else views are too few to hold some out, and patches are not tried
-        most += patches.iterations * sweep + choice * patches.trial_sweeps / CHOICE_SWEEPS
+        most += PnpDct.iterations * sweep + choice * trial_sweeps() / CHOICE_SWEEPS
         room = min(seconds, beside_steps)
     if most <= room:
         return FinishPlan(None, most)

@@ -36,6 +36,10 @@ THIN = 0.2
 what is on both sides of it. Without, cracks of half a voxel to one voxel go from 0.97 to 0.90 of their depth by total
 variation (60 views of 192 columns). On a packing it was not found on they keep 0.645 from 60 views, and 0.37 from 36;
 total variation 0.627 and 0.20."""
+APART = 1.1
+"""Distance of the levels that a volume is pulled to, over that of its materials: total variation draws voxels together.
+One, of 10⁴ photons: -0.1 dB on packed grains of 36 and 45 views and -0.3 on a cathode of 45, and cracks of half a voxel
+to one keep 0.61 of their depth from 60 views in place of 0.65; 1.16 takes as much dB as it brings."""
 PARTIAL = (0.5, 0.9)
 """Probabilities of a partial voxel, within a material and where two meet."""
 EMPTY = 0.02
@@ -88,6 +92,13 @@ def are_apart(levels: F64) -> bool:
 def gap_of(materials: MaterialPrior) -> float:
     """The geometric mean of the gaps between levels."""
     return float(np.exp(np.log(np.diff(materials.levels)).mean()))
+
+
+def drawn_apart(materials: MaterialPrior) -> MaterialPrior:
+    """The materials with levels `APART` as far from the middle between the outer ones."""
+    levels = np.array(materials.levels)
+    middle = (levels[0] + levels[-1]) / 2
+    return materials._replace(levels=tuple((middle + APART * (levels - middle)).tolist()))
 
 
 def thin_parts(x: F32, materials: MaterialPrior) -> NDArray[np.int8]:
