@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from recon.base.arrays import F32, some_values
-from recon.base.decisions import MATERIALS, Decisions
+from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, RunControl
 from recon.base.volume import Grid, Volume
@@ -121,8 +121,7 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
     if "weight" not in decided:
         raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
     smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
-    _, by_patches = decided.get("strength", [(0.0, 0)])[-1]
-    levels, *_ = decided.get(MATERIALS, [((),)])[-1]
+    (levels, *_), (_, by_patches) = decided.get("materials", [[()]])[-1], decided.get("strength", [(0.0, 0)])[-1]
     return pulling(allow_negative=method.allow_negative)[0] if levels else patches if by_patches else smooth
 
 

@@ -171,10 +171,9 @@ class Timing:
         if method.finish_sweeps == 0:
             return Forecast(0.0, {method.name: pace.total})
         finish = self._rendered(method) + self._smooth.fixed + method.finish_sweeps * self._smooth.each
-        choice = self.trial_seconds(FistaTv())
+        choice = self.trial_seconds(FistaTv() if method.finish is not None else PnpDct())
         if method.finish is None:
-            pulls = sum(each.refused_sweeps for each in pulling()) / CHOICE_SWEEPS
-            choice = self.trial_seconds(PnpDct()) + pulls * choice
+            choice += sum(each.refused_sweeps for each in pulling()) / CHOICE_SWEEPS * self.trial_seconds(FistaTv())
             finish += PnpDct.iterations * self.pace(PnpDct()).each
         return Forecast(choice, {method.name: pace.total + finish})
 

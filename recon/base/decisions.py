@@ -10,10 +10,6 @@ from typing import Any, NamedTuple, Self, TypeVar
 T = TypeVar("T")
 
 
-MATERIALS = "materials"
-"""Name of the decision which few materials voxels are pulled to, a `MaterialPrior` in the units of the scan."""
-
-
 class MaterialPrior(NamedTuple):
     """Few materials that voxels are pulled to, and how.
 

@@ -75,11 +75,6 @@ def refine(problem: VoxelProblem, x: F32, weight: NoiseBalance | float, strength
     return pnp_dct(further, x, strength, steps=PnpDct.iterations)
 
 
-def trial_sweeps() -> int:
-    """Sweeps of the trials that choose the prior of a finish, as a rule."""
-    return PnpDct().trial_sweeps + sum(method.refused_sweeps for method in pulling())
-
-
 @dataclass
 class _Finish:
     """The refinement as an iterative method of `recon.voxels.iterative.solve`.
@@ -167,7 +162,7 @@ def finish(
 
     refined = solve_views(
         method, projector, prepared, start=start, nonnegative=nonnegative,
-        watch=Watch(on_sweep, TrialWatch(control, n_views, trial_sweeps())), decide=decide,
+        watch=Watch(on_sweep, TrialWatch(control, n_views, PnpDct().trial_sweeps)), decide=decide,
     )  # fmt: skip
     return Finished(refined, min(count, made))
 

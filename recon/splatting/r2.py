@@ -15,7 +15,7 @@ from recon.base.method import Clock, Plain, ReconProblem, Reconstruction, RunCon
 from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.splatting.anytime import while_views_come
-from recon.splatting.finish import FINISH_SWEEPS, trial_sweeps
+from recon.splatting.finish import FINISH_SWEEPS
 from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.initialise import default_count
@@ -86,7 +86,7 @@ class R2(Fit):
     def trial_sweeps(self) -> int:
         """Sweeps on voxels and steps of a trial, as a rule."""
         refined = FINISH_SWEEPS + PnpDct.iterations
-        return trial_sweeps() + round(FIRST_SHARE * (self.planned_steps or 0)) + refined
+        return PnpDct().trial_sweeps + round(FIRST_SHARE * (self.planned_steps or 0)) + refined
 
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction of a fit by steps with the usual finish; of another one that of its volume."""

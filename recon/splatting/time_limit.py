@@ -14,14 +14,14 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Iterative
 from recon.base.volume import Grid
-from recon.splatting.finish import FINISH_SWEEPS, finish, trial_sweeps
+from recon.splatting.finish import FINISH_SWEEPS, finish
 from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
 from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import subsets_of
+from recon.voxels.priors import pulling, subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.trial import SUBSETS, TV_STEPS
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
@@ -84,10 +84,12 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
         return FinishPlan(0, 0.0)
     sweep = sweep_seconds(geometry, grid, now)
     before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
-    choice = choice_sweeps(geometry) * sweep
+    choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
     most, room = before + FINISH_SWEEPS * sweep, seconds
     if choice:  # else views are too few to hold some out, and patches are not tried
-        most += PnpDct.iterations * sweep + choice * trial_sweeps() / CHOICE_SWEEPS
+        most += patches.iterations * sweep + choice * (
+            patches.trial_sweeps + sum(method.refused_sweeps for method in pulling())
+        ) / CHOICE_SWEEPS  # fmt: skip
         room = min(seconds, beside_steps)
     if most <= room:
         return FinishPlan(None, most)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from recon.base.arrays import F32
-from recon.base.decisions import MATERIALS, GoesOn, MaterialPrior, Prior
+from recon.base.decisions import GoesOn, MaterialPrior, Prior
 from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.method import Plain
 from recon.base.setting import Count
@@ -27,9 +27,9 @@ from recon.voxels.projector import volume_lines
 from recon.voxels.trial import SUBSETS, TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
-UNDECIDED, _OF = "undecided_share", "_of_materials"
-"""Names of the decision on the expected share of voxels on the wrong side of half way between two materials; and how
-settings end that state the materials."""
+MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
+"""Names of the decisions on the materials, in the units of the scan, and on the expected share of voxels on the wrong
+side of half way between two; and how settings end that state the materials."""
 _TRIALS = 6  # trials of materials, as a rule
 
 
