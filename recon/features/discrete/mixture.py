@@ -41,7 +41,7 @@ APART = 1.1
 One, of 10⁴ photons: -0.1 dB on packed grains of 36 and 45 views and -0.3 on a cathode of 45, and cracks of half a voxel
 to one keep 0.61 of their depth from 60 views in place of 0.65; 1.16 takes as much dB as it brings. With the share of
 total variation between octaves, four packings that neither was found on gain 0.4 to 0.8 dB from 36 views, and 0.2 and
-0.5 from 60, and cracks there keep 0.69 for 0.65."""
+0.5 from 60, where cracks keep 0.69 for 0.65; ellipsoids in a cone lose 0.1."""
 PARTIAL = (0.5, 0.9)
 """Probabilities of a partial voxel, within a material and where two meet."""
 EMPTY = 0.02
