@@ -20,6 +20,7 @@ from recon.splatting.fit_method import Fit
 from recon.voxels.direct import Fbp, direct
 from recon.voxels.iterative import VoxelMethod, Watch, solve_views
 from recon.voxels.methods import FistaTv, PnpDct
+from recon.voxels.priors import pulling
 from recon.voxels.projector import Projector
 
 HALO = 8  # Slices beside a slab, at least, that its error bars need
@@ -120,8 +121,8 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
     if "weight" not in decided:
         raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
     smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
-    _, by_patches = decided.get("strength", [(0.0, 0)])[-1]
-    return patches if by_patches else smooth
+    (levels, *_), (_, by_patches) = decided.get("materials", [[()]])[-1], decided.get("strength", [(0.0, 0)])[-1]
+    return pulling(allow_negative=method.allow_negative)[0] if levels else patches if by_patches else smooth
 
 
 def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:

@@ -16,7 +16,7 @@ class MaterialPrior(NamedTuple):
     Attributes:
         levels: densities of the materials, ascending; none: voxels are not pulled.
         weights: shares of the materials in the sample.
-        tv_share: of the weight of total variation that remains.
+        tv_share: weight of total variation beside the pull, over that without one.
         pull: c of the step c (z - x), where a step of the views is one.
     """
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from recon.base.decisions import Decisions, GoesOn
 from recon.base.empirical import FEW_WILD, WILD_RAY
 from recon.base.geometry import Geometry
 from recon.base.method import ReconProblem, RunControl
-from recon.base.registry import loaded
 from recon.base.stripes import ring_offsets
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
@@ -26,7 +25,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
 from recon.voxels.iterative import TrialWatch, Watch, solve_views
 from recon.voxels.methods import PnpDct
-from recon.voxels.priors import PULLS, NoiseBalance, Subsets, ordered_fista, pnp_dct
+from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct, pulling
 from recon.voxels.projector import Projector
 from recon.voxels.trial import SUBSETS, TV_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
@@ -92,8 +91,7 @@ class _Finish:
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(Trial.of, problem))
         weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
-        for entry in PULLS.values() if self.patches else ():
-            method: Any = getattr(loaded(entry.module), entry.cls)()
+        for method in pulling() if self.patches else ():
             if materials := method.materials(problem, weight, trial):
                 self.planned, first = self.iterations + method.iterations, GoesOn(problem.go_on)
                 x = refine(replace(problem, go_on=first), x, weight, strength, self.iterations)

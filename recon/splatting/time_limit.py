@@ -21,7 +21,7 @@ from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
 from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import subsets_of
+from recon.voxels.priors import pulling, subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.trial import SUBSETS, TV_STEPS
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
@@ -87,7 +87,9 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
     most, room = before + FINISH_SWEEPS * sweep, seconds
     if choice:  # else views are too few to hold some out, and patches are not tried
-        most += patches.iterations * sweep + choice * patches.trial_sweeps / CHOICE_SWEEPS
+        most += patches.iterations * sweep + choice * (
+            patches.trial_sweeps + sum(method.refused_sweeps for method in pulling())
+        ) / CHOICE_SWEEPS  # fmt: skip
         room = min(seconds, beside_steps)
     if most <= room:
         return FinishPlan(None, most)

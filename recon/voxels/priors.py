@@ -24,7 +24,7 @@ from recon.base.empirical import (
 )
 from recon.base.geometry import Geometry
 from recon.base.noise import noise_beside_structure
-from recon.base.registry import MethodEntry, in_folders
+from recon.base.registry import MethodEntry, in_folders, loaded
 from recon.kernels.cpu.tv import total_variation
 from recon.voxels.devices import LineProjector, projector_on, voxel_device
 from recon.voxels.projector import Projector
@@ -159,6 +159,11 @@ RENEWED = 2
 
 # Methods with a pull that views held out may prefer, also after the sweeps of a fit, see `Discrete`.
 PULLS: dict[str, MethodEntry] = in_folders("recon.features", "PULLS")
+
+
+def pulling(**settings: Any) -> list[Any]:
+    """The methods of `PULLS`, with these settings."""
+    return [getattr(loaded(entry.module), entry.cls)(**settings) for entry in PULLS.values()]
 
 
 class Pull(Protocol):

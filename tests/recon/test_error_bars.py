@@ -97,6 +97,8 @@ def test_a_fit_is_refitted_with_the_weight_of_its_finish() -> None:
     [
         ({"strength": [[0.1, 1]]}, "pnp-dct"),
         ({"strength": [[0.1, 0]]}, "fista-tv"),
+        ({"materials": [[[0.1, 0.4], [0.5, 0.5], 0.5, 0.02]]}, "discrete"),
+        ({"materials": [[[], [], 1.0, 0.0]], "strength": [[0.1, 1]]}, "pnp-dct"),
         ({}, "fista-tv"),
     ],
 )

@@ -70,6 +70,20 @@ def test_each_method_that_is_compared_can_be_foretold(name: str) -> None:
     assert found is not None and 0 < found.least <= found.most < math.inf
 
 
+def test_the_finish_of_a_fit_tries_few_materials_before_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = Geometry.parallel(np.linspace(0, np.pi, 20, endpoint=False), (8, 32))
+
+    def choice_seconds(method: Method) -> float:
+        found = forecast(method, views, Grid.matching(views), SteppedClock(0.0, 0.01))
+        assert found is not None
+        return found.choice_seconds
+
+    smooth, with_materials = choice_seconds(recon.FistaTv()), choice_seconds(recon.R2())
+    monkeypatch.setattr("recon.forecast.pulling", list)
+    added = recon.Discrete().refused_sweeps / recon.FistaTv().trial_sweeps
+    assert with_materials - choice_seconds(recon.R2()) == pytest.approx(added * smooth)
+
+
 def test_what_a_time_ends_takes_it_and_several_volumes_have_to_be_tried() -> None:
     ended: Method = recon.R2(seconds=30.0)
     found = forecast(ended, VIEWS, GRID, SteppedClock(0.0))

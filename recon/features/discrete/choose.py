@@ -60,14 +60,8 @@ class MaterialTrial:
         # Of a tooth and of a rod with a pin of metal the best is 0.3 and 1 % worse here, of packed grains 4 % better.
         if not count or np.square(best).sum() >= np.square(self.smooth).sum():
             return
-        whole = self._tried(count, 1.0, PULLS[0])
-        if significantly_better(best, whole[0], LEAST_GAIN):
-            before = None
-            while before is not chosen and chosen.tv_share > _LEAST_SHARE:
-                before = chosen
-                best, chosen = self._better(best, chosen, count, chosen.tv_share / 2)
-        else:
-            best, chosen = whole
+        best, chosen, tv_share = self._share_of_smoothing(best, chosen)
+        chosen = chosen._replace(tv_share=tv_share)
         for pull in PULLS[1:]:
             best, chosen = self._better(best, chosen, count, chosen.tv_share, pull)
         if not significantly_better(best, self.smooth, LEAST_GAIN):
@@ -76,6 +70,29 @@ class MaterialTrial:
         continued = self._trial.volume_of_weight(self._weight, self._start, self._sweeps)
         if significantly_better(best, self._trial.residuals(continued), LEAST_GAIN):
             self.best, self.materials = best, chosen
+
+    def _share_of_smoothing(self, best: F64, chosen: MaterialPrior) -> tuple[F64, MaterialPrior, float]:
+        """The heaviest share of total variation in octaves, from all of it down, that half of it does not beat by
+        `LEAST_GAIN`: its residuals and materials; and up to an octave above the share that the least residual beats by
+        just that much, where the residual is taken as linear in octaves.
+
+        Views held out prefer less total variation than the truth does: where they are 45 of 256 columns by an octave
+        or more. Without the last step -0.2 dB at 45 views, -0.5 at 90.
+        """
+        count, tried = len(chosen.levels), {chosen.tv_share: (best, chosen)}
+
+        def at(tv_share: float) -> tuple[F64, MaterialPrior]:
+            if tv_share not in tried:
+                tried[tv_share] = self._tried(count, tv_share, PULLS[0])
+            return tried[tv_share]
+
+        share = 1.0
+        while share > _LEAST_SHARE and significantly_better(at(share / 2)[0], at(share)[0], LEAST_GAIN):
+            share /= 2
+        lighter, own, heavier = (float(at(each)[0].mean()) for each in (share / 2, share, 2 * share))
+        spare = min(lighter, own) / (1 - LEAST_GAIN) - own
+        octaves = min(max(spare / (heavier - own), 0.0), 1.0) if heavier > own else 1.0
+        return *at(share), share * 2.0**octaves
 
     def _better(
         self, best: F64, chosen: MaterialPrior, count: int, tv_share: float = _FIRST_SHARE, pull: float = PULLS[0]

@@ -16,8 +16,8 @@ from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.method import Plain
 from recon.base.setting import Count
 from recon.base.volume import Volume
-from recon.features.discrete.choose import PULLS, MaterialTrial, in_field
-from recon.features.discrete.mixture import MaterialPull, probabilities, thin_parts, undecided_share
+from recon.features.discrete.choose import COUNTS, PULLS, MaterialTrial, in_field
+from recon.features.discrete.mixture import MaterialPull, drawn_apart, probabilities, thin_parts, undecided_share
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
@@ -69,6 +69,11 @@ class Discrete(VoxelMethod):
     def trial_sweeps(self) -> int:
         """Sweeps for the weight of total variation, and with materials."""
         return CHOICE_SWEEPS + _TRIALS * self.iterations
+
+    @property
+    def refused_sweeps(self) -> int:
+        """Sweeps of the trials after which few materials are refused and patches may be tried, as a rule."""
+        return len(COUNTS) * self.iterations
 
     @classmethod
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
@@ -131,7 +136,7 @@ class Discrete(VoxelMethod):
         subsets = Subsets.of(problem, SUBSETS, FEWEST_SUBSETS)
         x = ordered_fista(
             further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS,
-            pull=MaterialPull(materials, where, thin),
+            pull=MaterialPull(drawn_apart(materials), where, thin),
         )  # fmt: skip
         share = problem.decide(UNDECIDED, lambda: undecided_share(x[where], materials))
         of_scan = materials.scaled(problem.units.density)._asdict()

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from recon.base.decisions import MaterialPrior
 from recon.features.discrete.mixture import (
+    APART,
     DOUBT,
     NOISE,
     SPREAD,
     MaterialPull,
     are_apart,
+    drawn_apart,
     fitted_levels,
     gap_of,
     probabilities,
@@ -88,6 +90,12 @@ def test_levels_are_fixed_points_and_noise_near_them_shrinks() -> None:
     np.testing.assert_allclose(pull.target(x), x, atol=2e-3)
     noisy = x + np.random.default_rng(0).normal(0, 0.05, x.shape).astype(np.float32)
     assert np.std(pull.target(noisy) - x) < 0.75 * np.std(noisy - x)
+
+
+def test_levels_are_drawn_apart_about_the_middle_between_the_outer_ones() -> None:
+    apart = drawn_apart(THREE)
+    np.testing.assert_allclose(apart.levels, (0.5 - APART / 2, 0.5 - 0.2 * APART, 0.5 + APART / 2))
+    assert apart._replace(levels=THREE.levels) == THREE
 
 
 def test_levels_that_follow_a_volume_stay_where_two_of_them_would_meet() -> None:

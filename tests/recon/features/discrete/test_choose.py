@@ -1,0 +1,68 @@
+"""How much total variation remains beside few materials: by residuals that a trial is told, in place of volumes."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import recon
+from recon.features.discrete.choose import PULLS, MaterialTrial
+
+F32 = NDArray[np.float32]
+VIEWS = recon.Geometry.parallel(np.arange(20) * np.pi / 20, (4, 16))
+VIEWS_HELD_OUT = 3
+
+
+class ToldTrial:
+    """A trial whose volumes leave what `residuals_by_share` says, and three materials or another pull more than all."""
+
+    ended = False
+
+    def __init__(self, residuals_by_share: dict[float, float]) -> None:
+        self.problem = SimpleNamespace(projector=SimpleNamespace(grid=recon.Grid.matching(VIEWS), geometry=VIEWS))
+        self.smooth = np.array((0.25, 0.5, 1.0), np.float32)[np.arange(16 * 16 * 4).reshape(16, 16, 4) % 3]
+        self._by_share, self._by_volume = residuals_by_share, {id(self.smooth): 1.0}
+        self.made: list[F32] = []  # so that no two volumes have one id
+
+    def volume_of_weight(self, weight: float, start: F32, sweeps: int, pull: Any = None) -> F32:
+        usual = pull is not None and len(pull.materials.levels) == 2 and pull.share == PULLS[0]
+        self.made.append(start.copy())
+        self._by_volume[id(self.made[-1])] = self._by_share[pull.materials.tv_share] if usual else 1.5
+        return self.made[-1]
+
+    def residuals(self, x: F32) -> NDArray[np.float64]:
+        return np.full(VIEWS_HELD_OUT, self._by_volume[id(x)])
+
+
+def chosen_share(residuals_by_share: dict[float, float]) -> float:
+    trial: Any = ToldTrial(residuals_by_share)
+    choice = MaterialTrial(trial, 1.0, 16, None)
+    choice.choose()
+    assert len(choice.materials.levels) == 2 and choice.materials.pull == PULLS[0]
+    return choice.materials.tv_share
+
+
+@pytest.mark.parametrize(
+    ("residuals_by_share", "share"),
+    [
+        ({2: 0.98, 1: 0.95, 0.5: 0.96}, 2 ** (0.95 * (1 / 0.98 - 1) / 0.03)),  # all of it is best: up to 2 % more
+        ({2: 0.95, 1: 0.95, 0.5: 0.96}, 2.0),  # twice the weight predicts as well
+        ({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.69}, 0.5 * 2 ** ((0.69 / 0.98 - 0.70) / 0.10)),
+        ({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.68, 0.125: 0.667}, 0.25 * 2 ** ((0.667 / 0.98 - 0.68) / 0.02)),
+    ],
+)
+def test_the_heaviest_share_is_taken_that_predicts_views_within_2_percent(
+    residuals_by_share: dict[float, float], share: float
+) -> None:
+    assert chosen_share(residuals_by_share) == pytest.approx(share)
+
+
+def test_few_materials_that_predict_no_better_are_refused_after_two_volumes() -> None:
+    trial: Any = ToldTrial({0.5: 1.01})
+    choice = MaterialTrial(trial, 1.0, 16, None)
+    choice.choose()
+    assert not choice.materials.levels and len(trial.made) == recon.Discrete().refused_sweeps / 16
