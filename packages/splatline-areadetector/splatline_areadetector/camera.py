@@ -310,16 +310,20 @@ class AreaDetectorCamera:
             case Refused(_, why):
                 self._fail(f"its frames cannot be taken: {why}")
             case Died(code):
-                self._fail(f"the process that receives its frames has ended ({code}), and another one is started")
+                self._fail(
+                    f"the process that receives its frames has ended ({code}), and another one is started",
+                    state="Frames taken before are good",
+                )
             case Disconnected():
-                self._fail("its IOC has gone", "Look whether it runs; it goes on when it is back")
+                advice = "Look whether it runs; it goes on when it is back"
+                self._fail("its IOC has gone", advice, "Frames taken before are good")
             case ArrayFrame(is_current=False):
                 self._take_frame(item)
 
-    def _fail(self, problem: str, advice: str = "") -> None:
-        self._problem = DeviceError(
-            self.name, problem, advice=advice, state="It is still armed, and frames taken before are good"
-        )
+    def _fail(
+        self, problem: str, advice: str = "", state: str = "It is still armed, and frames taken before are good"
+    ) -> None:
+        self._problem = DeviceError(self.name, problem, advice=advice, state=state)
 
     def _take_frame(self, item: ArrayFrame) -> None:
         shape = self.timing_of(self._own, self._settings).shape

@@ -77,13 +77,13 @@ def losses_told(gaps: Sequence[Gap], overflowed: Collection[int], counters: Coun
     """A sentence for each cause of lost frames.
 
     Args:
-        overflowed: numbers for which the ring had no room.
+        overflowed: numbers of frames for which the receiver had no room.
     """
     causes: dict[str, list[int]] = {}
     for gap in gaps:
         for i in gap.ids:
             if i in overflowed:
-                cause = f"by {OURS}, whose ring was full: the disk is too slow (ride.ring_mb)"
+                cause = f"by {OURS}, whose memory for waiting frames was full: the disk is too slow (ride.ring_mb)"
             elif gap.still > _LONG:
                 cause = f"by {OURS}, which stood still for {gap.still:.1f} s (ride.queue_s)"
             else:
@@ -117,7 +117,7 @@ class Silence:
         return time.monotonic() - self._since
 
     def look(self) -> None:
-        """Say it if it is time. InstrumentError: the server does not answer."""
+        """Say why, where no frame has come for `seconds`. InstrumentError: the server does not answer."""
         if self.lasted < self._seconds:
             return
         self.frame_came()

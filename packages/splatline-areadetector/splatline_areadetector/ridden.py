@@ -113,13 +113,13 @@ class RiddenFrames:
                 self._row += 1
 
     def _from_stream(self) -> Iterator[Frame]:
-        last = 0.0
+        stored_until = 0.0
         while not (self._sorter.complete or self._stop.aborting):
             self._refuse_pause()
             item = self._stream.next(SLICE)
             if self._stop.stopping:  # what was on its way is still stored
-                last = last or time.time() + SLICE
-                if item is None or (isinstance(item, ArrayFrame) and item.received > last):
+                stored_until = stored_until or time.time() + SLICE
+                if item is None or (isinstance(item, ArrayFrame) and item.received > stored_until):
                     return
             match item:
                 case None:
@@ -163,8 +163,8 @@ class RiddenFrames:
             return None
         before, self._last, self._gone = self._last, frame, False
         if isinstance(place, Outside):
-            if place.skipped and before is not None:
-                self._add_gap(range(before.unique_id + 1, before.unique_id + 1 + len(place.skipped)), before, frame)
+            if place.lost and before is not None:
+                self._add_gap(place.lost, before, frame)
             self._end_block()
             if not (place.repeated or self._told_of_outside):
                 self._told_of_outside = True
@@ -264,7 +264,7 @@ class RiddenFrames:
         """Sentences on what is missing and whose loss it was, each after a space.
 
         Args:
-            ended: the scan did, by itself.
+            ended: whether the scan ended by itself: no stop, no new epoch.
         """
         words = []
         for i, block in enumerate(self._plan.blocks):

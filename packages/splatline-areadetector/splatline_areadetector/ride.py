@@ -118,7 +118,7 @@ def _exposure(ride: Ride, planned: float | None, first: ArrayFrame) -> float | N
     camera, told = ride.counters.camera, first.attributes.get(EXPOSURE)
     by_frame = float(told) if isinstance(told, int | float) else None
     by_camera = None if camera is None else camera.number("AcquireTime_RBV")
-    return ride.config.ride.exposure_s or planned or by_frame or by_camera
+    return ride.config.ride.exposure_s or planned or by_frame or by_camera or None
 
 
 def _with_exposure(plan: RidePlan, ride: Ride, first: ArrayFrame) -> RidePlan:

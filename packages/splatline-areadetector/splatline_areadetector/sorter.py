@@ -44,11 +44,11 @@ class Place:
 
 @dataclass(frozen=True)
 class Outside:
-    """A frame that is not stored: of no scan, beyond its block's plan, or seen before; `skipped`: as of `Place`, at the
-    end of the block."""
+    """A frame that is not stored: of no scan, beyond its block's plan, or seen before; `lost`: numbers of the frames at
+    the block's end that did not come, of its first frame beyond where the count did not begin anew in between."""
 
     repeated: bool = False
-    skipped: range = range(0)
+    lost: range = range(0)
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Sorter:
     def __init__(self, blocks: Sequence[PlannedBlock], first_id: int | None = None) -> None:
         self._planned, self._first_id = tuple(blocks), first_id
         self._taken: dict[int, _Taken] = {}  # by the number of the planned block; extra ones follow
-        self._now, self._serial, self._closed = -1, -1, False
+        self._now, self._serial, self._closed, self._fell = -1, -1, False, False
         self.repeats = 0
 
     def take(self, unique_id: int, phase: Phase, *, reconnected: bool = False) -> Place | Outside | NewEpoch:
@@ -99,7 +99,7 @@ class Sorter:
         current = self._taken.get(self._now)
         fell = False
         if current is not None and unique_id < current.last_id:
-            fell = True
+            fell = self._fell = True
             if reconnected or (phase.serial == self._serial and not (self._closed or current.is_over)):
                 return NewEpoch(
                     f"frame numbers began anew at {unique_id}, after {current.last_id}: the server restarted, or its "
@@ -126,9 +126,10 @@ class Sorter:
         current = self._taken.get(self._now)
         if current is None or self._closed or unique_id < current.first_id + current.n:
             return Outside()
-        skipped, self._closed = range(current.last_id + 1 - current.first_id, current.n), True
-        current.last_id = current.first_id + current.n - 1
-        return Outside(skipped=skipped)
+        end, self._closed = current.first_id + current.n, True
+        lost = range(0) if self._fell else range(current.last_id + 1, end)
+        current.last_id = end - 1
+        return Outside(lost=lost)
 
     def _begin(self, unique_id: int, phase: Phase) -> Place | Outside:
         kind, first = phase.kind, unique_id
@@ -139,7 +140,7 @@ class Sorter:
             first = self._first_id
         n = next((block.n for block in self._planned if block.kind is kind), UNPLANNED)
         trigger = unique_id - first
-        self._serial, self._closed = phase.serial, trigger >= n
+        self._serial, self._closed, self._fell = phase.serial, trigger >= n, False
         if self._closed:
             return Outside()
         free = (i for i, block in enumerate(self._planned) if block.kind is kind and i not in self._taken)

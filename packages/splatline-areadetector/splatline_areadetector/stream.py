@@ -207,17 +207,21 @@ class FrameStream:
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            pipesize=_PIPE,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             start_new_session=True,
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
             | getattr(subprocess, "CREATE_NO_WINDOW", 0),
         )
+        with suppress(ImportError, AttributeError, OSError):  # a user may own so many pages of pipes, and no more
+            import fcntl
+
+            assert self._process.stdout is not None
+            fcntl.fcntl(self._process.stdout.fileno(), fcntl.F_SETPIPE_SZ, _PIPE)
 
     def _end(self) -> None:
-        self._over = True
-        self._process.kill()
         with self._changed:
+            self._over = True
+            self._process.kill()
             self._changed.notify_all()
         self._reader.join()
 
@@ -234,8 +238,10 @@ class FrameStream:
                 self._ready.set()
                 return
             self._put(Died(code))
-            time.sleep(_AGAIN)
-            self._start()
+            with self._changed:
+                if self._changed.wait_for(lambda: self._over, _AGAIN):
+                    return
+                self._start()
 
     def _take(self, stream: IO[bytes], what: str, *facts: Any) -> None:
         match what:

@@ -290,6 +290,14 @@ def test_frames_that_are_refused(tmp_path: Path, value: dict[str, Any], ride: di
     assert isinstance(told.error, ConfigError | DataError) and sentence in str(told.error) and not stored(tmp_path)
 
 
+def test_a_camera_that_tells_no_exposure_time_tells_none(tmp_path: Path) -> None:
+    with FakeIoc(camera=True) as ioc:
+        ioc.put({"cam1:AcquireTime_RBV": 0.0})
+        config = config_of(tmp_path, ioc.url, camera="pva://T:cam1:", exposure_s=None)
+        told = ride_along(config, tmp_path, lambda stop: ioc.send(range(1, 3)))
+    assert "Nothing tells the exposure" in str(told.error) and not stored(tmp_path)
+
+
 def test_a_binned_stream_is_refused_unless_it_is_named(tmp_path: Path) -> None:
     value = array_value(counts_of(1), 1)
     value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 2, "reverse": False} for n in (24, 16)]

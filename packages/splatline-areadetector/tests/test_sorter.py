@@ -61,12 +61,22 @@ def test_frames_that_are_missing_at_the_end_are_known_once_later_ones_come() -> 
     """A ride by a plan would wait for them for ever."""
     sorter = Sorter(BLOCKS[1:2])
     assert sorter.take(1, VIEWS) == Place(0, VIEW, 0) and sorter.take(3, VIEWS) == Place(0, VIEW, 2, range(1, 2))
-    assert not sorter.complete and sorter.take(9, VIEWS) == Outside(skipped=range(3, 5))
+    assert not sorter.complete and sorter.take(9, VIEWS) == Outside(lost=range(4, 6))
     assert sorter.complete and sorter.missing(0) == [1, 3, 4] and sorter.take(10, VIEWS) == Outside()
     sorter = Sorter(BLOCKS)
     places = [sorter.take(i, phase) for i, phase in ((1, DARKS), (3, VIEWS), (8, FLATS), (12, NO_SCAN))]
-    assert places[3] == Outside(skipped=range(1, 3)) and sorter.complete  # the last dark and view did not come
+    assert places[3] == Outside(lost=range(9, 11)) and sorter.complete  # the last dark and view did not come
     assert [sorter.missing(i) for i in range(3)] == [[1], [1, 2, 3, 4], [1, 2]]
+
+
+def test_frames_that_are_missing_at_the_end_have_numbers_of_their_own_block() -> None:
+    sorter = Sorter(BLOCKS[1:2])
+    sorter.take(1, VIEWS)
+    assert sorter.pass_over(3) == range(2, 4) and sorter.take(9, VIEWS) == Outside(lost=range(4, 6))
+    sorter = Sorter(BLOCKS[1:2])
+    assert sorter.take(3, VIEWS) == Place(0, VIEW, 0)
+    assert [sorter.take(i, NO_SCAN) for i in (1, 8, 9)] == [Outside()] * 3  # a free run's own count: these came
+    assert sorter.complete and sorter.missing(0) == [1, 2, 3, 4]
 
 
 def test_the_first_projection_by_its_number_and_by_a_second_count() -> None:

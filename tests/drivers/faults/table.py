@@ -107,11 +107,14 @@ LINE: tuple[LineFault, ...] = (
 )
 
 
-def phases_of(kind: str, phases: Sequence[Phase], fault: int = 0) -> Sequence[Phase]:
-    """Those of the phases in which a fault is tried on a controller: the controllers share them, and of a row of the
-    table another one begins than of the next."""
-    n = (list(KINDS).index(kind) + fault) % len(KINDS)
-    return phases[n :: len(KINDS)] or phases[-1:]
+def phases_of(kind: str, row: LineFault) -> Sequence[Phase]:
+    """Those in which a fault is tried on a controller: each on the first one that it stops, and the other ones that it
+    stops share them; the last one where it is harmless."""
+    stopped = [each for each in KINDS if each not in row.not_on and each not in row.harmless_on]
+    if kind not in stopped:
+        return row.phases[-1:]
+    n = stopped.index(kind)
+    return row.phases[n - 1 :: len(stopped) - 1] if n else row.phases
 
 
 def slow_but(kind: str) -> list[pytest.MarkDecorator]:
@@ -119,7 +122,7 @@ def slow_but(kind: str) -> list[pytest.MarkDecorator]:
     return [pytest.mark.slow] * (kind != next(iter(KINDS)))
 
 
-def one_each(rows: Sequence[Any]) -> list[Any]:
+def one_quick_each(rows: Sequence[Any]) -> list[Any]:
     """For `parametrize`: each row with each controller, of which one is quick, another one for each row."""
     return [
         pytest.param(row, kind, id=f"{row.fault}-{kind}", marks=[pytest.mark.slow] * ((n - k) % len(KINDS) > 0))

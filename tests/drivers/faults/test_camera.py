@@ -62,8 +62,10 @@ def assert_lost(rig: Rig, scanned: Scanned, runs: Path, fault: str) -> list[int]
 
 
 def test_every_camera_fault_of_the_table_has_a_test() -> None:
-    tests = " ".join(name for name in globals() if name.startswith("test_"))
-    assert all(fault.replace(" ", "_") in tests for fault in ROWS)
+    tested = {
+        fault for name in globals() if name.startswith("test_") for fault in name.removeprefix("test_").split("_or_")
+    }
+    assert {fault.replace(" ", "_") for fault in ROWS} <= tested
 
 
 def test_camera_absent_at_start(rig: Rig, tmp_path: Path) -> None:
@@ -123,7 +125,7 @@ def test_an_error_of_the_library_at_connecting(rig: Rig, call: str, tmp_path: Pa
     assert_not_begun(rig, scanned, tmp_path)
 
 
-def test_frame_lost_in_the_camera_or_on_its_slow_link(rig: Rig, tmp_path: Path) -> None:
+def test_frame_lost_in_the_camera_or_slow_link(rig: Rig, tmp_path: Path) -> None:
     """The scan names them, and that the link may be too slow."""
     rig.world.lose(3, 7)
     scanned = rig.scan(tmp_path)

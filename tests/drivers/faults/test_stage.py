@@ -23,7 +23,7 @@ from tests.drivers.faults.rig import VIEWS, Rig
 RigOf = Callable[[str], Rig]
 
 
-@pytest.mark.parametrize(("row", "kind"), table.one_each(table.MOTION))
+@pytest.mark.parametrize(("row", "kind"), table.one_quick_each(table.MOTION))
 def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: str, tmp_path: Path) -> None:
     """The views before it are in the file; no view is called missing, for it was never reached."""
     rig = rig_of(kind)
@@ -40,7 +40,7 @@ def test_a_stage_that_stops_early(rig_of: RigOf, row: table.MotionFault, kind: s
     assert_next_scan_works(rig, tmp_path, row.flags.get(kind, ""))
 
 
-@pytest.mark.parametrize(("row", "kind"), table.one_each(table.MOTION[:2]))
+@pytest.mark.parametrize(("row", "kind"), table.one_quick_each(table.MOTION[:2]))
 def test_a_stage_that_stops_early_in_a_step_scan(
     rig_of: RigOf, row: table.MotionFault, kind: str, tmp_path: Path
 ) -> None:
@@ -56,7 +56,7 @@ def test_a_stage_that_stops_early_in_a_step_scan(
     assert_kept(scanned, list(range(6)))
 
 
-@pytest.mark.parametrize(("row", "kind"), table.one_each(table.PULSES))
+@pytest.mark.parametrize(("row", "kind"), table.one_quick_each(table.PULSES))
 def test_a_trigger_cable_that_loses_or_picks_up_pulses(
     rig_of: RigOf, row: table.PulseFault, kind: str, tmp_path: Path
 ) -> None:
