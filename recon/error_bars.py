@@ -20,7 +20,7 @@ from recon.splatting.fit_method import Fit
 from recon.voxels.direct import Fbp, direct
 from recon.voxels.iterative import VoxelMethod, Watch, solve_views
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import pulling
+from recon.voxels.priors import pull_methods
 from recon.voxels.projector import Projector
 
 HALO = 8  # Slices beside a slab, at least, that its error bars need
@@ -122,13 +122,13 @@ def method_on_voxels(method: Method, decided: Mapping[str, Sequence[Any]]) -> Me
         raise ValueError(f"error bars of {method.name} need its finish on voxels, and there was none")
     smooth, patches = (one(allow_negative=method.allow_negative) for one in (FistaTv, PnpDct))
     (levels, *_), (_, by_patches) = decided.get("materials", [[()]])[-1], decided.get("strength", [(0.0, 0)])[-1]
-    return pulling(allow_negative=method.allow_negative)[0] if levels else patches if by_patches else smooth
+    return pull_methods(allow_negative=method.allow_negative)[0] if levels else patches if by_patches else smooth
 
 
 def error_bars_memory(method: Method, geometry: Geometry, grid: Grid) -> int:
     """Peak memory of `error_bars` in bytes, without the projections, their weights and the volume."""
     rays, voxels = geometry.n_views * math.prod(geometry.detector_shape), math.prod(grid.shape)
-    made_by = (FistaTv(), PnpDct()) if isinstance(method, Fit) else (method,)
+    made_by = (FistaTv(), PnpDct(), *pull_methods()) if isinstance(method, Fit) else (method,)
     work = max(one.memory(geometry, grid, True) for one in made_by)
     return work + 4 * (2 * rays + 5 * voxels)
 

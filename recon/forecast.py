@@ -25,7 +25,7 @@ from recon.voxels.choice import TRIALS
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, choice_sweeps
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import STEPS, pulling
+from recon.voxels.priors import STEPS, pull_methods
 
 VOXELS = 2**20
 """Of the part that is timed: as many as caches of a processor do not hold several times."""
@@ -173,7 +173,9 @@ class Timing:
         finish = self._rendered(method) + self._smooth.fixed + method.finish_sweeps * self._smooth.each
         choice = self.trial_seconds(FistaTv() if method.finish is not None else PnpDct())
         if method.finish is None:
-            choice += sum(each.refused_sweeps for each in pulling()) / CHOICE_SWEEPS * self.trial_seconds(FistaTv())
+            choice += (
+                sum(each.refused_sweeps for each in pull_methods()) / CHOICE_SWEEPS * self.trial_seconds(FistaTv())
+            )
             finish += PnpDct.iterations * self.pace(PnpDct()).each
         return Forecast(choice, {method.name: pace.total + finish})
 

@@ -25,7 +25,7 @@ from recon.splatting.settings import FitSettings
 from recon.splatting.splat import project, voxel_means
 from recon.voxels.iterative import TrialWatch, Watch, solve_views
 from recon.voxels.methods import PnpDct
-from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct, pulling
+from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista, pnp_dct, pull_methods
 from recon.voxels.projector import Projector
 from recon.voxels.trial import SUBSETS, TV_STEPS, Trial, choose_patches, choose_weight
 from recon.voxels.voxel_problem import VoxelProblem
@@ -91,7 +91,7 @@ class _Finish:
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(Trial.of, problem))
         weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
-        for method in pulling() if self.patches else ():
+        for method in pull_methods() if self.patches else ():
             if materials := method.materials(problem, weight, trial):
                 self.planned, first = self.iterations + method.iterations, GoesOn(problem.go_on)
                 x = refine(replace(problem, go_on=first), x, weight, strength, self.iterations)

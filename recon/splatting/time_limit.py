@@ -21,7 +21,7 @@ from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
 from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import pulling, subsets_of
+from recon.voxels.priors import pull_methods, subsets_of
 from recon.voxels.projector import Projector
 from recon.voxels.trial import SUBSETS, TV_STEPS
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
@@ -88,7 +88,7 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     most, room = before + FINISH_SWEEPS * sweep, seconds
     if choice:  # else views are too few to hold some out, and patches are not tried
         most += patches.iterations * sweep + choice * (
-            patches.trial_sweeps + sum(method.refused_sweeps for method in pulling())
+            patches.trial_sweeps + sum(method.refused_sweeps for method in pull_methods())
         ) / CHOICE_SWEEPS  # fmt: skip
         room = min(seconds, beside_steps)
     if most <= room:

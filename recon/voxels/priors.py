@@ -161,7 +161,7 @@ RENEWED = 2
 PULLS: dict[str, MethodEntry] = in_folders("recon.features", "PULLS")
 
 
-def pulling(**settings: Any) -> list[Any]:
+def pull_methods(**settings: Any) -> list[Any]:
     """The methods of `PULLS`, with these settings."""
     return [getattr(loaded(entry.module), entry.cls)(**settings) for entry in PULLS.values()]
 

@@ -79,7 +79,7 @@ def test_the_finish_of_a_fit_tries_few_materials_before_patches(monkeypatch: pyt
         return found.choice_seconds
 
     smooth, with_materials = choice_seconds(recon.FistaTv()), choice_seconds(recon.R2())
-    monkeypatch.setattr("recon.forecast.pulling", list)
+    monkeypatch.setattr("recon.forecast.pull_methods", list)
     added = recon.Discrete().refused_sweeps / recon.FistaTv().trial_sweeps
     assert with_materials - choice_seconds(recon.R2()) == pytest.approx(added * smooth)
 

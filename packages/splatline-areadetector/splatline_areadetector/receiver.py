@@ -76,7 +76,7 @@ class Receiver:
     """Takes the updates of an image; one thread does, and another one passes them on.
 
     Args:
-        room: bytes of frames that may wait. One always may.
+        room: bytes of frames that may wait. A single frame may always wait, however large.
     """
 
     def __init__(self, room: int, now: Callable[[], float] = time.time) -> None:
@@ -90,7 +90,7 @@ class Receiver:
         received = self._now()
         if isinstance(value, Exception):
             if not self._fresh:  # every subscription begins disconnected
-                self.say("gone")
+                self.put("gone")
             self._fresh = True
             return
         is_current, self._fresh = self._fresh, False
@@ -99,25 +99,25 @@ class Receiver:
             if frame is not None:
                 self._take_frame(frame)
         except FrameRefusedError as error:
-            self.say("refused", int(value.uniqueId), str(error))
+            self.put("refused", int(value.uniqueId), str(error))
         except BaseException as error:
-            self.say("refused", -1, f"it cannot be read ({error!r})")
+            self.put("refused", -1, f"it cannot be read ({error!r})")
         if not self._ready:
             self._ready = True
-            self.say("ready")
+            self.put("ready")
 
-    def say(self, *facts: Any, payload: NDArray[Any] | None = None) -> None:
-        """Pass on an item that is no frame."""
+    def put(self, *facts: Any, payload: NDArray[Any] | None = None) -> None:
+        """Queue an item, and a frame's pixels."""
         self._items.put(([*facts], payload))
 
     def _take_frame(self, frame: ArrayFrame) -> None:
         waiting = self._taken - self._passed
         if waiting and waiting + frame.n_bytes > self._room:
-            self.say("overflow", frame.unique_id)
+            self.put("overflow", frame.unique_id)
             return
         self._taken += frame.n_bytes
         facts = {**vars(frame), "payload": [frame.payload.dtype.str, frame.payload.size], "dtype": frame.dtype.str}
-        self.say(
+        self.put(
             "frame",
             {**facts, "window": asdict(frame.window), "attributes": {**frame.attributes}},
             payload=frame.payload,
@@ -174,7 +174,7 @@ def main(name: str, n_frames: str, room: str) -> None:
             while True:
                 receiver.pass_on(stream)
 
-    for work in (pass_on, lambda: _watch_clock(receiver.say)):
+    for work in (pass_on, lambda: _watch_clock(receiver.put)):
         threading.Thread(target=work, daemon=True).start()
     subscribed = Subscribed({name: receiver.take}, f"record[queueSize={n_frames}]")
     while os.read(0, 1024):

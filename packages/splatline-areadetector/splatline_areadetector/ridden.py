@@ -64,7 +64,7 @@ class EpochEndedError(LedgerError):
     """The file has ended before the scan, as its frames' numbers began anew or their size changed."""
 
 
-def outside_told(guide: Guide) -> str:
+def outside_sentence(guide: Guide) -> str:
     """What is said of frames of no scan."""
     status = f" ({guide.status})" if guide.status else ""
     return f"Frames of no scan come{status}: they are not stored."
@@ -168,7 +168,7 @@ class RiddenFrames:
             self._end_block()
             if not (place.repeated or self._told_of_outside):
                 self._told_of_outside = True
-                self._sink(StateEntered(self._measurement.states.state, outside_told(self._guide)))
+                self._sink(StateEntered(self._measurement.states.state, outside_sentence(self._guide)))
             return None
         if place.block != self._block:
             place = self._begin_block(place, frame)

@@ -29,7 +29,7 @@ from splatline_areadetector.config import RideConfig, TomoscanAngles
 from splatline_areadetector.counters import Counters, Silence, refuse_mistakes
 from splatline_areadetector.guides import EXPOSURE, Guide, guide_of
 from splatline_areadetector.plan import PlannedBlock, RidePlan, ready_of
-from splatline_areadetector.ridden import SLICE, EpochEndedError, Images, RiddenFrames, Ride, outside_told
+from splatline_areadetector.ridden import SLICE, EpochEndedError, Images, RiddenFrames, Ride, outside_sentence
 from splatline_areadetector.stream import FrameStream, Refused
 
 _NOT_OURS = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)
@@ -96,7 +96,7 @@ def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
             return item
         if not told:
             told = True
-            ride.say(outside_told(guide))
+            ride.say(outside_sentence(guide))
     raise ScanAborted(f"Interrupted before the first frame: {ride.stop.reason}. Nothing was recorded.")
 
 

@@ -24,7 +24,7 @@ OF_KIND = {"fraction": (0.5, 0.3), "surface": (0.5, 0.2), "size": (0.0, 0.05), "
 half-width over what voxels twice as wide change it by; of others OTHERS. Found, as the figures above, on simulated
 grains, and looked at once on others (docs/structure.md). Sizes and tortuosities moved either way."""
 OTHERS = 0.5, 0.3
-OTHERWISE = 0.62
+SPLIT_OR_MERGED = 0.62
 """Of n whole particles some are split, merged or cut otherwise than in the sample: the share s of their volume below a
 size lies off by this times √(s (1 - s) / n). Found on twenty scenes (docs/structure.md)."""
 LEVELS_MOVE = 0.5  # thresholds, over what half of the views move them by
@@ -158,7 +158,7 @@ def _of_particles(name: str, particles: Particles) -> float:
     if kind != "size" or particles.cut.all():
         return 0.0
     share = int(percent) / 100
-    off = OTHERWISE * math.sqrt(share * (1 - share) / np.count_nonzero(~particles.cut))
+    off = SPLIT_OR_MERGED * math.sqrt(share * (1 - share) / np.count_nonzero(~particles.cut))
     return (particles.quantile(share + off) - particles.quantile(share - off)) / 2
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatline_structure.intervals import OTHERWISE, _of_particles
+from splatline_structure.intervals import SPLIT_OR_MERGED, _of_particles
 from splatline_structure.particles import Particles
 
 
@@ -23,7 +23,7 @@ def grains(n: int, cut: bool = False) -> Particles:
 def test_a_size_is_as_sure_as_a_share_of_so_many_particles(percent: int) -> None:
     """A share s of n has the deviation √(s (1 - s) / n), and each share of the volume here is 8 µm wide."""
     share = percent / 100
-    off = OTHERWISE * np.sqrt(share * (1 - share) / 400)
+    off = SPLIT_OR_MERGED * np.sqrt(share * (1 - share) / 400)
     assert _of_particles(f"size_{percent}", grains(400)) == pytest.approx(8 * off, rel=0.05)
 
 
