@@ -31,16 +31,21 @@ from recon.voxels.projector import volume_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
-_WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one
+WIDE, _FEWEST_ROWS = 0.9, 4  # share that the field has of a wide box, at most; rows of a trial in one
 SUBSETS, TV_STEPS = 9, 3  # of a trial, and of the finish of a fit
 PATCH_STEPS = 35
 """Steps with sparse patches of a trial, and by default of `PnpDct`."""
 
 
+def share_in_field(geometry: Geometry, grid: Grid) -> float:
+    """Width of the field over that of the box."""
+    return 2 * geometry.reach / (grid.shape[2] * grid.voxel_size)
+
+
 def _trial_rows(geometry: Geometry, grid: Grid) -> int:
     """Rows of a trial: fewer in a box that is wider than the field, so that it takes no longer."""
-    share = 2 * geometry.reach / (grid.shape[2] * grid.voxel_size)
-    return TRIAL_ROWS if share > _WIDE else max(_FEWEST_ROWS, round(TRIAL_ROWS * share))
+    share = share_in_field(geometry, grid)
+    return TRIAL_ROWS if share > WIDE else max(_FEWEST_ROWS, round(TRIAL_ROWS * share))
 
 
 def choose_weight(
