@@ -91,7 +91,7 @@ class Shake:
 
 
 SIGMAS = 8.0
-LEAST_SHAKE = 0.02  # of a cell: smaller ones are not reported on large frames, of which a cell has many pixels
+LEAST_SHAKE = 0.02  # of a cell; on a large frame, whose cells have many pixels, a smaller shake is not reported
 GONE, GROWN = 0.5, 2.0  # of its limit, below which a shake has gone; times the reported one, above which it is again
 CONFIRMED = 0.5  # of a figure; if less of it differs from row to row, this part counts: a ghost is as high as the frame
 

@@ -25,8 +25,9 @@ from beamline.storage.readers.base import ScanSource
 from beamline.storage.rules.evidence import ScanEvidence
 from beamline.storage.rules.scan import altered_sentence
 from recon.prep import counts_plan
-from recon.prep.correct import LinesPlan, Plan, apply
+from recon.prep.correct import Plan, apply
 from recon.prep.counts_plan import CorrectionPlan, UnlitViewsError
+from recon.prep.lines_plan import LinesPlan
 from recon.prep.projections import Projections, merge_and_empty
 
 _COPIES = 3  # float32 copies of the views that are corrected at once

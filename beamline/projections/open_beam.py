@@ -27,9 +27,9 @@ from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.arrays import Mask
 from recon.base.choices import FEW_PHOTONS
 from recon.base.views import spread
-from recon.prep.correct import LinesPlan
 from recon.prep.counts import Photons, photon_transfer
 from recon.prep.counts_plan import CorrectionSettings, survey
+from recon.prep.lines_plan import LinesPlan
 from recon.prep.references import SHADOW_REACH, References, shadowed
 from recon.prep.unmeasured import foreign_rows
 

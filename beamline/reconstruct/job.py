@@ -18,17 +18,12 @@ from beamline.core.recon_events import FitReached
 from beamline.core.sinks import Warnings
 from beamline.core.stop import StopScope
 from beamline.projections.prepared import PreparedProjections
+from beamline.reconstruct.budget import in_budget
 from beamline.reconstruct.checkpoints import origin_of
 from beamline.reconstruct.memory import cluster
 from beamline.reconstruct.options import ReconOptions
 from beamline.reconstruct.region import RegionOfRows
-from beamline.reconstruct.run import (
-    deviation_by_slabs,
-    deviation_of,
-    in_budget,
-    run_on,
-    without_outside,
-)
+from beamline.reconstruct.run import deviation_by_slabs, deviation_of, run_on, without_outside
 from beamline.reconstruct.scan_facts import ScanFacts
 from beamline.reconstruct.slab_run import SlabWorkers, in_slabs
 from drivers.base.clock import Clock

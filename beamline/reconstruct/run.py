@@ -1,4 +1,4 @@
-"""Run a method on prepared views, as every command does that makes a volume; its time, budget and error bars."""
+"""Run a method on prepared views, as every command does that makes a volume; its time and its error bars."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +31,6 @@ from recon.base.slabs import Slab, part_of, slabs_of
 from recon.base.view_data import Views
 from recon.base.volume import Grid, Volume
 from recon.error_bars import HALO, LEAST_VIEWS, ErrorBars, error_bars
-from recon.forecast import Timing
 from recon.methods import by_name, names_where, with_settings
 from recon.splatting.fit_method import Fit
 
@@ -222,50 +221,3 @@ def _bars(
     views = Views(prepared.projections.data, prepared.geometry, _weights(method, prepared))
     problem = ReconProblem(views, volume.grid, seed=options.seed, device=options.device)
     return error_bars(method, problem, volume, decided, replace(control, decide=None))
-
-
-_TIMED_VOXELS = 2**17  # of the part that is timed: what it takes counts
-
-
-def in_budget(
-    method: Method, budget: float, geometry: Geometry, grid: Grid, now: Callable[[], float], warn: Warn
-) -> tuple[Method, str]:
-    """The choice restricted to methods that end in time, or to the quickest; and in words which stay, and why.
-
-    A few iterations of each are timed, then forecasts are compared with the seconds that are left. Nothing else
-    changes: the methods that are left run as without a budget, to their own end.
-
-    Args:
-        warn: is told where even the quickest will be late.
-
-    Raises:
-        ValueError: no method takes these views.
-    """
-    end = now() + budget
-    timing = Timing(geometry, grid, now, _TIMED_VOXELS)
-    kept, seconds, refused = list[Method](), dict[str, float](), list[str]()
-    for each in method.alternatives:
-        try:
-            seconds[each.name] = timing.of(each).most
-            kept.append(each)
-        except ValueError as error:
-            refused.append(f"{each.name}: {error}")
-    if not kept:
-        raise ValueError("; ".join(refused))
-    chosen, expected = _without_slow(method, kept), 0.0
-    while (expected := timing.of(chosen).most) > end - now() and len(kept) > 1:
-        kept.remove(max(kept, key=lambda each: seconds[each.name]))
-        chosen = _without_slow(method, kept)
-    if (late := expected - (end - now())) > 0:
-        warn(
-            f"{duration_text(budget)} are too short for this scan: the quickest method, {kept[0].name}, runs all "
-            f"the same and ends about {duration_text(late)} late."
-        )
-    names = [each.name for each in kept]
-    out = [f"{name} would take about {duration_text(some)}" for name, some in seconds.items() if name not in names]
-    return chosen, "; ".join((f"{duration_text(budget)} for {' or '.join(names)}", *out))
-
-
-def _without_slow(method: Method, kept: list[Method]) -> Method:
-    """The choice among `kept` alone; the only method left as itself."""
-    return kept[0] if len(kept) == 1 else cast(Method, replace(cast(Any, method), candidates=tuple(kept)))

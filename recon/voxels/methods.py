@@ -207,9 +207,9 @@ class PnpDct(VoxelMethod):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction with the best threshold; with one of its own that of the method's volume.
 
-        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.prior`.
+        Of a sample wider than the field it is not tried beside simpler methods, see `Trial.wide`.
         """
-        if self.patch_threshold is None and so_far.tried and trial.settings.wide:
+        if self.patch_threshold is None and so_far.tried and trial.wide:
             return Prediction(self.name, remark=f"{self.name} not tried, as the sample is wider than the field")
         if self.patch_threshold is not None or trial.prior is None or not trial.prior.strength:
             return trial.predicted(self)

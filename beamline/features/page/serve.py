@@ -1,10 +1,6 @@
 """Server of a run, or of a folder of runs: on this machine alone by default, with new tokens at each start.
 
-The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`, to look alone. Connections whose
-requests have the token are handed on before all others. The event loop accepts some hundred connections a second if
-each becomes a protocol at once; the others wait in the system, whose queue overflows, and a connection that it drops is
-tried again after a second or three. In `Entrance` to accept is a call of the system, so that thousands a second may
-come.
+The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`, to look alone.
 """
 
 from __future__ import annotations
@@ -48,7 +44,11 @@ _HEAD = 65536  # bytes of a request in which the token is looked for
 
 
 class Entrance:
-    """The listening socket of a page, until `close`.
+    """The listening socket of a page, until `close`: whose request has the token is served before all others.
+
+    The event loop accepts some hundred connections a second if each becomes a protocol at once. The others wait in the
+    system, and one that its full queue drops is tried again after a second or three. Here to accept is one call of the
+    system, so that thousands a second may come.
 
     Args:
         protocol: makes the protocol of a connection that is handed on.

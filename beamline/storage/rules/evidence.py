@@ -25,7 +25,7 @@ from recon.prep.references import dark_at
 from recon.prep.unmeasured import with_borders_filled
 
 VIEWS, BESIDE = 32, 2  # views that flats must not look like: so many of all, and so many on either side of each group
-CELLS_ACROSS = 32  # the frame, about: means of pixels by which flats are compared with views
+CELLS_ACROSS = 32  # flats are compared with views by means of pixels: the frame is about so many wide
 WORST = 99.0  # percentile of the places of a view that counts, so that zingers do not
 EXPOSURE_TOLERANCE = 1e-3  # cameras round an exposure
 LEAST = 0.01  # share of the light of the brightest views, in a view's own bright part: all matter leaves that much open

@@ -76,7 +76,7 @@ REASONS = {
     "BADAXIS": "there is no such axis",
     "BADCOMMAND": "it does not know this command or setting",
     "BADDATA": "a value is missing or out of its range",
-    "BADMESSAGEID": "the message id is none",
+    "BADMESSAGEID": "it cannot read the number of the message",
     "DEVICEONLY": "this is asked of the device only",
     "DRIVERDISABLED": "its driver is disabled",
     "FULL": "its memory is full",

@@ -32,8 +32,7 @@ class Tomoscan(PVGroup):  # type: ignore[misc]  # caproto has no types
     FlatExposureTime = pvproperty(value=0.01)
     DifferentFlatExposure = _choice("Different", ["Same", "Different"])
 
-    @RotationStart.startup  # type: ignore[no-redef]
-    async def RotationStart(self, instance: Any, library: Any) -> None:  # noqa: N802
+    async def _listen(self, instance: Any, library: Any) -> None:
         while line := await asyncio.get_running_loop().run_in_executor(None, sys.stdin.readline):
             name, _, value = line.strip().partition("=")
             given: Any = value
@@ -42,6 +41,8 @@ class Tomoscan(PVGroup):  # type: ignore[misc]  # caproto has no types
             elif name.startswith("Rotation"):
                 given = float(value)
             await getattr(self, name).write(given)
+
+    RotationStart.startup(_listen)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from recon.base.decisions import MaterialPrior
 from recon.base.empirical import ONE_IN
 from recon.features.discrete.mixture import LEAST_NOISE, NOISE, MaterialPull, are_apart, fitted_levels
 from recon.voxels.choice import LEAST_GAIN, significantly_better
-from recon.voxels.trial import WIDE, Trial, share_in_field
+from recon.voxels.trial import Trial
 from recon.voxels.voxel_problem import VoxelProblem
 
 PULLS = (0.02, 0.005)
@@ -49,13 +49,8 @@ class MaterialTrial:
         self.best, self.materials = self.smooth, MaterialPrior()
 
     def choose(self) -> None:
-        """Choose number of materials, share of total variation and pull.
-
-        None in a box that is wider than the field: what lies beside it is in all views, and few materials leave less of
-        those held out where total variation is closer to the truth by 0.2 dB (1.5 times the field) and 1.7 (twice).
-        """
-        projector = self._trial.problem.projector
-        if self._levels is None and share_in_field(projector.geometry, projector.grid) <= WIDE:
+        """Choose number of materials, share of total variation and pull; if `Trial.wide`, of stated levels alone."""
+        if self._levels is None and self._trial.wide:
             return
         first, *others = COUNTS if self._levels is None else (len(self._levels),)
         best, chosen = self._tried(first, _FIRST_SHARE, PULLS[0])

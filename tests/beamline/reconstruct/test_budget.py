@@ -10,9 +10,9 @@ import pytest
 
 from beamline.core.events import Event
 from beamline.projections.selection import Selection
+from beamline.reconstruct.budget import in_budget
 from beamline.reconstruct.options import OutputPaths, ReconOptions
 from beamline.reconstruct.pipeline import reconstruct_file
-from beamline.reconstruct.run import in_budget
 from beamline.storage.readers.open import SourceOptions
 from beamline.storage.writers.recon_file import read_reconstruction
 from drivers.base.clock import SystemClock

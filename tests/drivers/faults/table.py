@@ -123,7 +123,7 @@ def slow_but(kind: str) -> list[pytest.MarkDecorator]:
 
 
 def one_quick_each(rows: Sequence[Any]) -> list[Any]:
-    """For `parametrize`: each row with each controller, of which one is quick, another one for each row."""
+    """For `parametrize`: each row with each controller; one is quick, in turn from row to row, the others slow."""
     return [
         pytest.param(row, kind, id=f"{row.fault}-{kind}", marks=[pytest.mark.slow] * ((n - k) % len(KINDS) > 0))
         for n, row in enumerate(rows)

@@ -201,7 +201,7 @@ def test_trials_see_the_columns_with_matter() -> None:
     assert columns_of_matter(views, grid, full) is None
 
 
-def _problem_of(data: F32, geometry: Geometry, weights: F32 | None = None) -> VoxelProblem:
+def _problem_of(data: F32, geometry: Geometry, weights: F32 | None = None, grid: Grid | None = None) -> VoxelProblem:
     """The problem of these views [view, row, col] as methods get it."""
     given: list[VoxelProblem] = []
 
@@ -210,7 +210,7 @@ def _problem_of(data: F32, geometry: Geometry, weights: F32 | None = None) -> Vo
             given.append(problem)
             return x
 
-    solve(Asking(), Projector(geometry, Grid.matching(geometry)), data.copy(), weight=weights)
+    solve(Asking(), Projector(geometry, grid or Grid.matching(geometry)), data.copy(), weight=weights)
     return given[0]
 
 
@@ -218,6 +218,13 @@ def _trial_of(data: F32, geometry: Geometry, weights: F32 | None = None) -> Tria
     trial = Trial.of(_problem_of(data, geometry, weights))
     assert trial is not None
     return trial
+
+
+def test_a_box_of_one_and_a_half_fields_is_wide_and_one_that_matches_is_not() -> None:
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (4, 32))
+    for cols, wide in ((32, False), (48, True)):
+        trial = Trial.of(_problem_of(np.ones((24, 4, 32), np.float32), geometry, grid=Grid((4, cols, cols))))
+        assert trial is not None and trial.wide is wide
 
 
 @pytest.mark.parametrize("weighted", [False, True], ids=["even rays", "air weighs most"])

@@ -1,0 +1,59 @@
+"""Budget: of the methods that a choice tries, those whose forecast ends in time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+from beamline.core.sinks import Warn
+from recon.assess.time_model import duration_text
+from recon.base.geometry import Geometry
+from recon.base.method import Clock, Method
+from recon.base.volume import Grid
+from recon.forecast import Timing
+
+_TIMED_VOXELS = 2**17  # of the part that is timed: what it takes counts
+
+
+def in_budget(
+    method: Method, budget: float, geometry: Geometry, grid: Grid, now: Clock, warn: Warn
+) -> tuple[Method, str]:
+    """The choice restricted to methods that end in time, or to the quickest; and in words which stay, and why.
+
+    A few iterations of each are timed, then forecasts are compared with the seconds that are left. Nothing else
+    changes: the methods that are left run as without a budget, to their own end.
+
+    Args:
+        warn: is told where even the quickest will be late.
+
+    Raises:
+        ValueError: no method takes these views.
+    """
+    end = now() + budget
+    timing = Timing(geometry, grid, now, _TIMED_VOXELS)
+    kept, seconds, refused = list[Method](), dict[str, float](), list[str]()
+    for each in method.alternatives:
+        try:
+            seconds[each.name] = timing.of(each).most
+            kept.append(each)
+        except ValueError as error:
+            refused.append(f"{each.name}: {error}")
+    if not kept:
+        raise ValueError("; ".join(refused))
+    chosen, expected = _without_slow(method, kept), 0.0
+    while (expected := timing.of(chosen).most) > end - now() and len(kept) > 1:
+        kept.remove(max(kept, key=lambda each: seconds[each.name]))
+        chosen = _without_slow(method, kept)
+    if (late := expected - (end - now())) > 0:
+        warn(
+            f"{duration_text(budget)} are too short for this scan: the quickest method, {kept[0].name}, runs all "
+            f"the same and ends about {duration_text(late)} late."
+        )
+    names = [each.name for each in kept]
+    out = [f"{name} would take about {duration_text(some)}" for name, some in seconds.items() if name not in names]
+    return chosen, "; ".join((f"{duration_text(budget)} for {' or '.join(names)}", *out))
+
+
+def _without_slow(method: Method, kept: list[Method]) -> Method:
+    """The choice among `kept` alone; the only method left as itself."""
+    return kept[0] if len(kept) == 1 else cast(Method, replace(cast(Any, method), candidates=tuple(kept)))

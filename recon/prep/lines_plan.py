@@ -1,0 +1,87 @@
+"""LinesPlan: how views that are line integrals already are used, as a `CorrectionPlan` uses counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from recon.base.arrays import Mask
+from recon.prep.projections import Projections
+from recon.prep.spots import SpotFilter, Transmission
+from recon.prep.unmeasured import NO_RUNS, runs_of, unmeasured
+
+_NOISY = 0.01  # of the line integrals of a view are below 0, where air has noise
+_DEEPEST = 60.0  # line integral: e^-60 is no light, and squares of e^60 are numbers
+
+
+@dataclass(frozen=True, eq=False)
+class LinesPlan:
+    """The plan of views that are line integrals already, which is used as a `CorrectionPlan` is.
+
+    Pixels that are not finite or measured nothing, and spots, are filled. There is no air, and nothing is masked but
+    pixels that no view has. Exact zeros at the corners are measured where air is 0 without noise.
+
+    Attributes:
+        spots, foreign: as of a `CorrectionPlan`.
+        masked: bool [row, col], pixels that have been finite in no view so far.
+    """
+
+    spots: SpotFilter
+    foreign: Mask | None = None
+    masked: Mask = field(default_factory=lambda: np.ones((1, 1), np.bool_))
+    air_columns: ClassVar[tuple[int, int]] = (0, 0)
+
+    @classmethod
+    def of(cls, zinger_threshold: float, foreign: Mask | None = None) -> LinesPlan:
+        """The plan before the first view; the threshold is that of `CorrectionSettings`."""
+        root = SpotFilter(zinger_threshold, lambda lines: np.exp(np.clip(lines, -_DEEPEST, _DEEPEST) / -2))
+        return cls(root, foreign)
+
+    def transmission(
+        self,
+        lines: NDArray[np.generic],
+        positions: NDArray[np.float64],
+        view_ids: NDArray[np.int64],
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Transmission:
+        """The line integrals; a pixel that measured nothing, or is not finite, takes the value of the nearest one."""
+        data = lines.astype(np.float32, copy=False)
+        bad, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
+        hidden = np.zeros(data.shape[1:], np.bool_)
+        for v, view in enumerate(data):
+            light = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
+            light[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
+            lost = bad[v]
+            if (unseen := unmeasured(view, light, hidden, self.foreign)) is not None:
+                runs.append(runs_of(unseen, int(view_ids[v])))
+                lost, repaired[v] = lost | unseen, -np.count_nonzero(lost & unseen)
+            repaired[v] += np.count_nonzero(bad[v])
+            if lost.any():
+                nearest = ndimage.distance_transform_edt(lost, return_distances=False, return_indices=True)
+                view[...] = view[tuple(nearest)]
+        ones = np.ones(len(data), np.float32)
+        return Transmission(data, view_ids, repaired, ones, None, np.concatenate(runs), bad.min(axis=0, initial=True))
+
+    def surveyed(self, views: Transmission) -> LinesPlan:
+        """The plan that masks what none of these views has either."""
+        return self if views.unseen is None else replace(self, masked=self.masked & views.unseen)
+
+    def line_integrals(
+        self,
+        views: Transmission | None,
+        last: bool = True,
+        progress: Callable[[int], None] = lambda done: None,
+        order: NDArray[np.intp] | None = None,
+    ) -> tuple[Projections, LinesPlan]:
+        """As of a `CorrectionPlan`."""
+        views, spots = self.spots.feed(views, last, progress, order)
+        replaced = float(views.repaired.sum()) / max(views.data.size, 1)
+        return Projections(
+            views.data, views.view_ids, 0.0, views.air, self.masked, replaced=replaced, unmeasured=views.unmeasured,
+            spots_left=spots.left,
+        ), replace(self, spots=spots)  # fmt: skip
