@@ -12,11 +12,12 @@ PAGE = (Path(__file__).parents[3] / "docs" / "file_layout.md").read_text(encodin
 
 
 def rows(title: str) -> list[list[str]]:
-    """Cells of the tables in a section of the page, without the heads."""
+    """Cells of the tables in a section of the page, without the heads; a row for each name in the first cell."""
     section = re.split(r"^#+ ", PAGE, flags=re.M)
     (text,) = [part for part in section if part.startswith(f"{title}\n")]
     lines = [line for line in text.splitlines() if line.startswith("| ")][1:]
-    return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    cells = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    return [[name, *others] for first, *others in cells for name in first.split(", ")]
 
 
 def names(title: str) -> list[str]:
