@@ -238,8 +238,8 @@ def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, scan: Path) -> N
 @pytest.mark.parametrize("ring", [2048.0, 5.0])
 @pytest.mark.slow
 def test_a_disk_of_5_mb_s(tmp_path: Path, scan: Path, ring: float) -> None:
-    """Frames of 173 kB at 80 a second: 13.8 MB/s. A ring that is large enough loses none; a small one is full within 6 s,
-    as are the 128 frames of the recorder."""
+    """Frames of 173 kB at 80 a second: 13.8 MB/s. A ring that is large enough loses none. A small one is full after
+    6 s, and so are the 128 frames of the recorder."""
     n, fps, source = 500, 80, tmp_path / "large.h5"
     with h5py.File(scan) as file, h5py.File(source, "w") as large:
         large["/exchange/data"] = file["/exchange/data"][:].repeat(2, 1).repeat(2, 2)
