@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -26,24 +27,25 @@ SHAPES = {10: (2048, 2048), 50: (64, 96)}  # by frames/s
 
 
 @contextmanager
-def _sending(ioc: FakeIoc, fps: int) -> Iterator[None]:
-    """The views of a rod that turns, in steps of 9°, over and over in a thread."""
-    (rows, columns), over = SHAPES[fps], threading.Event()
+def _sending(ioc: FakeIoc, fps: int) -> Iterator[Callable[[], None]]:
+    """The views of a rod that turns, in steps of 9°, over and over in a thread: two a second, until the function is
+    called."""
+    (rows, columns), over, fast = SHAPES[fps], threading.Event(), threading.Event()
     across = np.arange(columns) - columns / 2 - 0.1 * columns * np.cos(np.radians(9 * np.arange(20)))[:, np.newaxis]
     thickness = np.sqrt(np.clip(1 - (across / (0.3 * columns)) ** 2, 0, None))
     lines = (100 + 40000 * np.exp(-thickness)).astype(np.uint16)
     views = [np.broadcast_to(line, (rows, columns)).copy() for line in lines]
 
     def send() -> None:
-        begin, i = time.monotonic(), 0
-        while not over.wait(max(0.0, begin + i / fps - time.monotonic())):
+        for i in count():
             ioc.post(array_value(views[i % 20], i + 1))
-            i += 1
+            if over.wait(1 / fps if fast.is_set() else 0.5):
+                return
 
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        yield
+        yield fast.set
     finally:
         over.set()
         thread.join()
@@ -80,8 +82,11 @@ def test_a_stop_closes_the_file_and_a_second_ends_the_ride(tmp_path: Path, fps: 
     given = [word for name in ("darks", "flats") for word in (f"--{name}", str(tmp_path / f"{name}.npy"))]
     angles = {"from": "plan", "views": 2000, "start_deg": 0, "step_deg": 9}
     with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, *given, period_s=1 / fps, angles=angles) as ride:
-        with _sending(ioc, fps):
+        with _sending(ioc, fps) as full_speed:
             ride.wait_for(lambda: "The live volume is ready for views" in ride.output)
+            before = ride.frames()
+            full_speed()
+            ride.wait_for(lambda: ride.frames() > before + fps)
             ride.process.send_signal(number)
             answered = _seconds(lambda: "Stopping cleanly" in ride.output, ride)
             closed = answered + _seconds(lambda: "Waiting for the live volume" in ride.output, ride)
