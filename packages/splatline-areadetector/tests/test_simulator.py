@@ -152,7 +152,7 @@ def test_the_page_shows_a_growing_volume_and_the_last_is_that_of_the_file(tmp_pa
         n = len(finer["/exchange/data"])
     angles = {"from": "plan", "views": n, "start_deg": 0, "step_deg": 0.25}
     given = ("--page", "--darks", str(source), "--flats", str(source))
-    settings = {"period_s": 0.1, "queue_s": 3, "angles": angles}
+    settings: dict[str, Any] = {"period_s": 0.1, "queue_s": 3, "angles": angles}
     with served(source, 10) as start, RideProgram(tmp_path, IMAGE, *given, **settings) as ride:
         start()
         page = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
@@ -193,7 +193,8 @@ def test_the_page_shows_a_growing_volume_and_the_last_is_that_of_the_file(tmp_pa
 def test_a_ride_that_stands_still(tmp_path: Path, scan: Path, still: int, whole: bool) -> None:
     """Where its receiver stands still, too, the server bridges a second, and of five what is lost is named.
     The ride alone loses nothing. Nothing comes twice."""
-    n, queue = 450, {"period_s": 0.02, "queue_s": 2}  # other programs run here, too
+    n = 450
+    queue: dict[str, Any] = {"period_s": 0.02, "queue_s": 2}  # other programs run here, too
     with served(scan, 50) as start, RideProgram(tmp_path, IMAGE, "--no-live", **queue, **_views(n)) as ride:
         start()
         ride.wait_for(lambda: ride.frames() > 50)
@@ -243,7 +244,7 @@ def test_a_disk_of_5_mb_s(tmp_path: Path, scan: Path, ring: float) -> None:
     n, fps, source = 500, 80, tmp_path / "large.h5"
     with h5py.File(scan) as file, h5py.File(source, "w") as large:
         large["/exchange/data"] = file["/exchange/data"][:].repeat(2, 1).repeat(2, 2)
-    options = {"program": DISK.format(bytes_per_s=5e6), "ring_mb": ring, "period_s": 1 / fps}
+    options: dict[str, Any] = {"program": DISK.format(bytes_per_s=5e6), "ring_mb": ring, "period_s": 1 / fps}
     with served(source, fps) as start, RideProgram(tmp_path, IMAGE, "--no-live", **options, **_views(n)) as ride:
         start()
         code = ride.end()
