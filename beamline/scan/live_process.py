@@ -32,6 +32,7 @@ _GRACE = 120.0  # real s in which it may still write its volume, unless the oper
 _CLOSE = 5.0  # the same if the scan itself has failed
 _AGAIN = 2  # times that it is started again
 _POLL = 0.1  # real s between two checks of its readiness
+_SAY_EVERY = 5.0  # real s between two sentences on a volume that is waited for after a stop
 ASK_LIVE_AFTER = 4.0
 """Real s from the request to stop a scan to the request for the live reconstruction's volume. The volume then comes
 within 10 s; the time that the scan takes to end counts."""
@@ -100,11 +101,26 @@ def _words(scan: Path, flags: Sequence[str], options: Mapping[str, object]) -> S
 
 
 def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
-    """Whether the live reconstruction of an ended scan should end with its present volume. It should after an abort, a
-    new stop, or ASK_LIVE_AFTER after the scan's stop. Also with a `useless` file, which is broken or has no
-    projections."""
+    """Whether the live reconstruction of an ended scan should end with its present volume: after a new stop, or
+    ASK_LIVE_AFTER after that of the scan; also with a `useless` file, which is broken or has no projections."""
     last = ASK_LIVE_AFTER if stop.stopping else 0.0
-    return lambda: useless or stop.aborting or (stop.stopping and stop.seconds >= last)
+    return lambda: useless or (stop.stopping and stop.seconds >= last)
+
+
+def told_while_it_ends(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], bool]:
+    """Whether the scan was aborted, so that its live reconstruction should be killed. Asked while that ends, it says
+    how long a stopped scan has waited for the volume: at once, then every 5 s."""
+    due, most = 0.0, ASK_LIVE_AFTER + _GRACE
+
+    def aborting() -> bool:
+        nonlocal due
+        if stop.stopping and not stop.aborting and stop.seconds >= due:
+            due = stop.seconds + _SAY_EVERY
+            waited = f"{stop.seconds:.0f} of at most {most:.0f} s"
+            say(f"Waiting for the live volume of the views so far: {waited}. Ctrl-C or an abort ends without it")
+        return stop.aborting
+
+    return aborting
 
 
 class LiveReconstruction:
@@ -179,13 +195,13 @@ class LiveReconstruction:
 
         Args:
             stop: polled a few times a second; True asks it to end with its present volume.
-            hurry: polled in the same way; True kills it.
+            hurry: polled in the same way, and while it ends; True kills it.
         """
         with self._changing:
             process, self._wanted = self._process, False
         if process is None:
             return None
-        ending = process.wait(stop=stop, hurry=hurry, silence=self._silence, grace=_GRACE)
+        ending = process.wait(stop=lambda: hurry() or stop(), hurry=hurry, silence=self._silence, grace=_GRACE)
         if self._done is None:
             reasons = {
                 ProcessEnd.STOPPED: "it was stopped",

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 from beamline.config.load import Config, resolved_yaml
 from beamline.core.errors import (
@@ -21,12 +22,14 @@ from beamline.core.errors import (
 )
 from beamline.core.events import Failed, RunDone, RunStarted, Sink, StateEntered, Warned
 from beamline.core.files import CONFIG, EVENTS, RECON, RECON_LOG, REPORT, SCAN, USER_LOG, create_run_folder, new_log
+from beamline.core.machine import free_memory
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import Announcer, JsonLines, UserLog, fan_out
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import ConnectedDevices, clock_after, connect
 from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
-from beamline.scan.live_process import LiveCommand, reconstruct
+from beamline.scan.live_plan import live_plan
+from beamline.scan.live_process import LiveCommand, follow_command, reconstruct
 from beamline.scan.measurement import FrameSource, Measurement
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.resume import ResumableRun
@@ -34,6 +37,7 @@ from beamline.scan.runs import record_sink
 from beamline.scan.watchdog import watched
 from beamline.storage.run_record import RecordFile, RunRecord
 from drivers.base.clock import Clock, SystemClock
+from drivers.base.protocols import Devices
 from drivers.in_beam import Ask
 from drivers.stages.shared import FOUND
 
@@ -114,29 +118,30 @@ def record_scan(
     sinks: Sequence[Sink],
     stop: StopRequest,
     *,
-    instrument: ConnectedDevices,
-    live: LiveCommand | None = None,
+    live: bool,
 ) -> RunResult:
     """Record a scan that others control, in a run folder of its own, as `run_scan` does one of ours.
 
     Nothing waits for the live reconstruction, no watchdog runs, and no device is operated.
 
     Args:
-        config: its sections sample, storage, monitor, references, scan and devices.beam_monitor count.
+        config: its sections sample, storage, monitor, references, recon, scan and devices.beam_monitor count.
         source_of: makes what delivers the frames, from the measurement that takes them.
         runs: the folder in which the run gets its own.
-        instrument: has the clock.
+        live: with a live reconstruction.
 
     Raises:
         LedgerError: frames are missing. ScanStopped, ScanAborted: it was requested. DataError: the disk failed.
     """
-    began = time.monotonic()
+    began, others = time.monotonic(), ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)
+    views = live_plan(ready.timing.shape, ready.plan.angles.size, free_memory())
     with ExitStack() as stack:
-        folder = create_run_folder(runs, config.sample.name, SystemClock().now())
-        sink = _announcing(config, ready, folder, instrument.clock, sinks, stack)
-        measurement = Measurement(config, instrument, ready, folder, stop, sink, began, None, source_of)
+        folder = create_run_folder(runs, config.sample.name, others.clock.now())
+        sink = _announcing(config, ready, folder, others.clock, sinks, stack)
+        measurement = Measurement(config, others, ready, folder, stop, sink, began, None, source_of)
         stack.enter_context(verbs_taken(folder, stop, measurement.pause))
-        return _to_its_end(measurement, live, None, lambda: None)
+        command = follow_command(config, views) if live else None
+        return _to_its_end(measurement, command, None, lambda: None)
 
 
 def _announcing(

@@ -163,7 +163,7 @@ class RideConfig(Section):
 
 EXAMPLE = """\
 # A ride on the scan of another program (docs/areadetector.md). No process variable is written.
-# beamline ride FILE --check   shows what the IOC says, and whether a second of frames arrives whole.
+# beamline ride FILE --check   shows what the IOC says, and whether two seconds of frames arrive whole.
 # Units are in the names: s, deg, mm, um, keV. null means "not known" or "the default".
 
 sample: {name: tooth, description: "", diameter_mm: null}

@@ -7,23 +7,16 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import cast
 
 import numpy as np
 
 from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.events import Sink
-from beamline.core.machine import free_memory
 from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted
-from beamline.instrument.connect import ConnectedDevices
-from beamline.scan.live_plan import live_plan
-from beamline.scan.live_process import follow_command
 from beamline.scan.run import record_scan
 from beamline.storage.readers.reference_files import load_images
-from drivers.base.clock import SystemClock
 from drivers.base.frame import FrameKind
-from drivers.base.protocols import Devices
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig, TomoscanAngles
 from splatline_areadetector.counters import Counters, Silence, refuse_mistakes
@@ -31,9 +24,6 @@ from splatline_areadetector.guides import EXPOSURE, Guide, guide_of
 from splatline_areadetector.plan import PlannedBlock, RidePlan, ready_of
 from splatline_areadetector.ridden import SLICE, EpochEndedError, Images, RiddenFrames, Ride, outside_sentence
 from splatline_areadetector.stream import FrameStream, Refused
-
-_NOT_OURS = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)
-"""The devices of the scan that is ridden: nobody uses them here."""
 
 
 def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
@@ -54,11 +44,9 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
         plan = _with_given(own, ride.given, first.window.shape)
         ready = ready_of(ride.config, plan, first, ride.runs)
         source_of = partial(RiddenFrames, ride, own, first_id)
-        live_views = live_plan(first.window.shape, plan.angles.size, free_memory())
-        command = follow_command(config, live_views) if live and config.recon.live else None
         try:
             result = record_scan(
-                config, ready, source_of, ride.runs, sinks, ride.stop, instrument=_NOT_OURS, live=command
+                config, ready, source_of, ride.runs, sinks, ride.stop, live=live and ride.config.recon.live
             )
         except EpochEndedError as error:
             lost, first_id = error, None  # numbers of another epoch

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import h5py
 import numpy as np
@@ -94,6 +97,7 @@ class Stored:
     ids: NDArray[Any]
     triggers: NDArray[Any]
     degrees: NDArray[Any]
+    times: NDArray[Any]
     seconds: NDArray[Any]
     missing: list[int]
     status: str
@@ -110,9 +114,59 @@ def stored(folder: Path) -> list[Stored]:
 
 def _stored(path: Path) -> Stored:
     with h5py.File(path) as file:
-        log = file["/entry/frame_log"]
+        log, detector = file["/entry/frame_log"], file["/entry/instrument/detector"]
         return Stored(
-            file["/entry/instrument/detector/data"][()], log["kind"][()], log["framestamp"][()], log["trigger"][()],
-            file["/entry/sample/rotation_angle"][()], file["/entry/instrument/detector/count_time"][()],
+            detector["data"][()], log["kind"][()], log["framestamp"][()], log["trigger"][()],
+            file["/entry/sample/rotation_angle"][()], log["time"][()], detector["count_time"][()],
             file["/entry/progress/missing_triggers"][()].tolist(), file["/entry/progress/status"][()].decode(),
         )  # fmt: skip
+
+
+class RideProgram:
+    """`beamline ride` as a program, whose output is in a file. As a context it begins when the ride waits for frames,
+    and kills it at its end.
+
+    Args:
+        options: of the command.
+        program: what Python runs instead.
+        ride: settings of the section.
+    """
+
+    def __init__(self, folder: Path, image: str, *options: str, program: str = "", **ride: object) -> None:
+        section = {"image": image, "exposure_s": 0.01, "silence_s": 20, **ride}
+        config = {"sample": {"name": "s"}, "ride": section, "optics": {"pixel_size_um": 1}}
+        folder.mkdir(exist_ok=True)
+        (folder / "my.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+        words = ["ride", str(folder / "my.yaml"), "-o", str(folder / "runs"), *options]
+        begin = ["-c", program] if program else ["-m", "beamline.cli.main"]
+        self.folder, self._output = folder, folder / "output.txt"
+        with self._output.open("w") as stream:
+            self.process = subprocess.Popen([sys.executable, *begin, *words], stdout=stream, stderr=subprocess.STDOUT)
+
+    def __enter__(self) -> Self:
+        return self.wait_for(lambda: "Waiting for the first frame" in self.output)
+
+    def __exit__(self, *error: object) -> None:
+        self.process.kill()
+        self.process.wait()
+
+    @property
+    def output(self) -> str:
+        return self._output.read_text(encoding="utf-8")
+
+    def wait_for(self, reached: Callable[[], bool], seconds: float = 120.0) -> Self:
+        deadline = time.monotonic() + seconds
+        while not reached():
+            assert time.monotonic() < deadline and self.process.poll() is None, self.output
+            time.sleep(0.1)
+        return self
+
+    def frames(self) -> int:
+        """In the file so far."""
+        for path in (self.folder / "runs").glob("*/scan.h5"):
+            with suppress(OSError, KeyError), h5py.File(path, "r", swmr=True) as file:
+                return int(file["/entry/progress/frames_committed"][()])
+        return 0
+
+    def end(self, seconds: float = 400.0) -> int:
+        return self.process.wait(seconds)

@@ -15,7 +15,7 @@ import yaml
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 BEAMLINE = (sys.executable, "-m", "beamline.cli.main")
-VIEWS = 40
+VIEWS = 16
 
 
 @contextmanager
@@ -52,13 +52,14 @@ def test_our_scan_ridden_by_ours_is_equal_to_the_bit(loopback: dict[str, str], t
     (tmp_path / "runs").mkdir()
     scan = (
         "scan", "configs/simulated.yaml", "--no-live", "-o", tmp_path / "runs", "--set", "scan.mode=step",
-        "--set", f"scan.angles.views={VIEWS}", "--set", "scan.darks.count=4", "--set", "scan.flats.count=4",
+        "--set", f"scan.angles.views={VIEWS}", "--set", "scan.angles.span_deg=16",
+        "--set", "scan.darks.count=4", "--set", "scan.flats.count=4",
     )  # fmt: skip
     with ExitStack() as stack:
         server = stack.enter_context(_beamline("publish", tmp_path / "runs", "--prefix", "T:SPL:"))
         _until_line(server, "Ctrl-C ends this")
         rider = stack.enter_context(_beamline("ride", tmp_path / "my.yaml", "--no-live", "-o", tmp_path / "rides"))
-        said = _until_line(rider, "aits")
+        said = _until_line(rider, "Waiting for the first frame")
         own = stack.enter_context(_beamline(*scan))
         assert own.communicate(timeout=300)[0] is not None and own.returncode == 0
         said += rider.communicate(timeout=120)[0]

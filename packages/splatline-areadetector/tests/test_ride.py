@@ -34,6 +34,21 @@ def test_every_frame_once_with_its_angle(tmp_path: Path) -> None:
     assert np.array_equal(file.counts, [counts_of(i) for i in file.ids])
 
 
+def test_an_exposure_that_changes_during_the_scan_is_that_of_each_frame(tmp_path: Path) -> None:
+    def scan(stop: StopRequest) -> None:
+        for i in range(1, 21):
+            seconds = 0.02 if i < 9 else 0.05
+            ioc.put({"cam1:AcquireTime_RBV": seconds})
+            ioc.send(range(i, i + 1), attributes={"AcquireTime": seconds})
+
+    with FakeIoc(camera=True) as ioc:
+        told = ride_along(config_of(tmp_path, ioc.url, camera="pva://T:cam1:", exposure_s=None), tmp_path, scan)
+    assert told.error is None
+    (file,) = stored(tmp_path)
+    assert np.array_equal(file.ids, np.arange(1, 21)) and np.array_equal(file.counts, [counts_of(i) for i in file.ids])
+    assert np.allclose(file.seconds, [0.02] * 8 + [0.05] * 12) and not file.missing
+
+
 def _tomoscan(ioc: FakeIoc, stop: StopRequest, restarted: bool) -> None:
     """Free run, 3 darks, 4 flats, 8 projections, 4 flats, and free run before tomoscan says that it is complete.
 

@@ -5,27 +5,41 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import h5py
 import numpy as np
 import psutil
 import pytest
-import yaml
-from ridden import Stored, stored
-from scipy.ndimage import zoom
+from ridden import RideProgram, Stored, stored
 
 from drivers.base.frame import FrameKind
 
 pytestmark = [pytest.mark.timeout(900), pytest.mark.usefixtures("loopback")]
 CHANNEL = "P:Pva1:Image"
+IMAGE = f"pva://{CHANNEL}"
 MINUTE = 600  # frames, at 10 a second
+SIMULATOR = """
+import sys
+from pvapy.cli import adSimServer as simulator
+class Started(simulator.AdSimServer):
+    def framePublisher(self):
+        if not self.nPublishedFrames:
+            print("ready", flush=True)
+            sys.stdin.readline()
+        super().framePublisher()
+simulator.AdSimServer = Started
+simulator.main()
+"""  # its first frame waits for a line of stdin
 DISK = """
 import sys, time
 import beamline.storage.writers.rows as rows
@@ -45,59 +59,20 @@ def scan(shared_data: Path) -> Path:
 
 
 @contextmanager
-def served(source: Path, fps: float, seconds: float, delay: float, dataset: str = "/exchange/data") -> Iterator[None]:
-    """The simulator's frames, over and over, from `delay` s on."""
+def served(source: Path, fps: float) -> Iterator[Callable[[], None]]:
+    """The simulator, which sends the frames of a file over and over, from when the function is called."""
     pytest.importorskip("pvapy")
-    words = f"-if {source} -hds {dataset} -fps {fps} -cn {CHANNEL} -std {delay} -rt {seconds} -rp 100000 -dc -shd 1"
-    run = [sys.executable, "-m", "pvapy.cli.adSimServer", *words.split()]
-    server = subprocess.Popen(run, stdout=subprocess.DEVNULL)
-    try:
-        time.sleep(2)
-        yield
-    finally:
-        server.kill()
-        server.wait()
-
-
-class Ride:
-    """`beamline ride` as a program, whose output is in a file."""
-
-    def __init__(self, folder: Path, *options: str, program: str = "", **ride: object) -> None:
-        section = {"image": f"pva://{CHANNEL}", "exposure_s": 0.01, "silence_s": 20, **ride}
-        config = {"sample": {"name": "s"}, "ride": section, "optics": {"pixel_size_um": 1}}
-        (folder / "my.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
-        words = ["ride", str(folder / "my.yaml"), "-o", str(folder / "runs"), *options]
-        begin = ["-c", program] if program else ["-m", "beamline.cli.main"]
-        self.folder, self._output = folder, folder / "output.txt"
-        self._stream: IO[str] = self._output.open("w")
-        self.process = subprocess.Popen(
-            [sys.executable, *begin, *words], stdout=self._stream, stderr=subprocess.STDOUT, text=True
-        )
-
-    @property
-    def output(self) -> str:
-        return self._output.read_text(encoding="utf-8")
-
-    def wait_for(self, reached: Callable[[], bool], seconds: float = 120.0) -> None:
-        deadline = time.monotonic() + seconds
-        while not reached():
-            assert time.monotonic() < deadline and self.process.poll() is None, self.output
-            time.sleep(0.1)
-
-    def frames(self) -> int:
-        """In the file so far."""
-        for path in (self.folder / "runs").glob("*/scan.h5"):
-            try:
-                with h5py.File(path, "r", swmr=True) as file:
-                    return int(file["/entry/progress/frames_committed"][()])
-            except (OSError, KeyError):
-                return 0
-        return 0
-
-    def end(self, seconds: float = 400.0) -> int:
-        code = self.process.wait(seconds)
-        self._stream.close()
-        return code
+    words = f"-if {source} -hds /exchange/data -fps {fps} -cn {CHANNEL} -std 0 -rt 3600 -rp 100000 -dc -shd 1"
+    run = [sys.executable, "-c", SIMULATOR, *words.split()]
+    with subprocess.Popen(run, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdin is not None and server.stdout is not None
+            while (line := server.stdout.readline()) != "ready\n":
+                assert line, "the simulator has ended"
+            threading.Thread(target=server.stdout.read, daemon=True).start()
+            yield partial(print, file=server.stdin, flush=True)
+        finally:
+            server.kill()
 
 
 def _views(n: int) -> dict[str, Any]:
@@ -116,18 +91,50 @@ def _equal_to_the_bit(file: Stored, source: Path, step: float = 2.0) -> None:
     assert np.array_equal(file.triggers[views] - file.triggers[views][0], ids - ids[0])
 
 
+def _on_schedule(file: Stored, fps: float) -> None:
+    """The server sent each frame when it was due, by its own clock: no client slowed it."""
+    late = file.times - file.times[0] - (file.ids - file.ids[0]) / fps
+    assert np.abs(late - np.median(late)).max() < 0.8, late
+
+
 @pytest.mark.parametrize(
-    ("fps", "seconds"), [(10, 20), *(pytest.param(fps, 120, marks=pytest.mark.long) for fps in (10, 50))]
+    ("fps", "seconds"), [(10, 10), *(pytest.param(fps, 120, marks=pytest.mark.long) for fps in (10, 50))]
 )
 @pytest.mark.slow
 def test_every_frame_once(tmp_path: Path, scan: Path, fps: int, seconds: int) -> None:
     n = fps * seconds
-    with served(scan, fps, seconds + 5, 40):
-        ride = Ride(tmp_path, "--no-live", "--darks", str(scan), "--flats", str(scan), **_views(n))
+    given = ("--darks", str(scan), "--flats", str(scan))
+    with served(scan, fps) as start, RideProgram(tmp_path, IMAGE, "--no-live", *given, **_views(n)) as ride:
+        start()
         assert ride.end() in (0, 7), ride.output  # 7: the monitor sees that the scan comes over and over
     (file,) = stored(tmp_path)
     _equal_to_the_bit(file, scan)
     assert file.ids.tolist() == [-1, -1, *range(1, n + 1)] and file.status == "complete"
+
+
+@pytest.mark.slow
+def test_two_rides_and_a_viewer_of_one_server(tmp_path: Path, scan: Path) -> None:
+    n, fps = 200, 20
+    viewer = [sys.executable, str(Path(__file__).with_name("viewer.py")), CHANNEL]
+    with ExitStack() as stack:
+        start = stack.enter_context(served(scan, fps))
+        rides = [RideProgram(tmp_path / name, IMAGE, "--no-live", **_views(n)) for name in "ab"]
+        for ride in rides:
+            stack.enter_context(ride)
+        watching = stack.enter_context(subprocess.Popen(viewer, stdin=subprocess.PIPE, stdout=subprocess.PIPE))
+        stack.callback(watching.kill)
+        assert watching.stdout is not None and watching.stdout.readline() == b"ready\n"
+        start()
+        seen = [watching.stdout.readline() for _ in range(20)]
+        assert all(ride.end() in (0, 7) for ride in rides), [ride.output for ride in rides]
+    with h5py.File(scan) as source:
+        frames = source["/exchange/data"][()]
+    assert all(int(words[1]) == zlib.crc32(frames[int(words[0]) - 1].tobytes()) for words in map(bytes.split, seen))
+    for ride in rides:
+        (file,) = stored(ride.folder)
+        _equal_to_the_bit(file, scan)
+        assert file.ids.tolist() == [*range(1, n + 1)] and not file.missing
+        _on_schedule(file, fps)
 
 
 @pytest.mark.slow
@@ -144,10 +151,10 @@ def test_the_page_shows_a_growing_volume_and_the_last_is_that_of_the_file(tmp_pa
         finer["/exchange/data"] = np.rint(np.stack(between, 1)).reshape(-1, *views.shape[1:]).astype(np.uint16)
         n = len(finer["/exchange/data"])
     angles = {"from": "plan", "views": n, "start_deg": 0, "step_deg": 0.25}
-    with served(source, 10, n / 10 + 4, 60):
-        ride = Ride(
-            tmp_path, "--page", "--darks", str(source), "--flats", str(source), period_s=0.1, queue_s=3, angles=angles
-        )
+    given = ("--page", "--darks", str(source), "--flats", str(source))
+    settings: dict[str, Any] = {"period_s": 0.1, "queue_s": 3, "angles": angles}
+    with served(source, 10) as start, RideProgram(tmp_path, IMAGE, *given, **settings) as ride:
+        start()
         page = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
         address = list[str]()
 
@@ -186,8 +193,10 @@ def test_the_page_shows_a_growing_volume_and_the_last_is_that_of_the_file(tmp_pa
 def test_a_ride_that_stands_still(tmp_path: Path, scan: Path, still: int, whole: bool) -> None:
     """Where its receiver stands still, too, the server bridges a second, and of five what is lost is named.
     The ride alone loses nothing. Nothing comes twice."""
-    with served(scan, 50, 24, 40):
-        ride = Ride(tmp_path, "--no-live", period_s=0.02, queue_s=2, **_views(1000))  # other programs run here, too
+    n = 450
+    queue: dict[str, Any] = {"period_s": 0.02, "queue_s": 2}  # other programs run here, too
+    with served(scan, 50) as start, RideProgram(tmp_path, IMAGE, "--no-live", **queue, **_views(n)) as ride:
+        start()
         ride.wait_for(lambda: ride.frames() > 50)
         process = psutil.Process(ride.process.pid)
         stopped = [process, *([each for each in process.children() if "receiver" in str(each.cmdline())] * whole)]
@@ -200,7 +209,8 @@ def test_a_ride_that_stands_still(tmp_path: Path, scan: Path, still: int, whole:
         code = ride.end()
     (file,) = stored(tmp_path)
     _equal_to_the_bit(file, scan)
-    missing = sorted({*range(1000)} - {*(file.ids - 1).tolist()})
+    _on_schedule(file, 50)
+    missing = sorted({*range(n)} - {*(file.ids - 1).tolist()})
     assert file.missing == missing and ((still > 1 and whole) or not missing) and len(missing) < 50 * still
     if missing:
         assert code == 5 and "were lost by this program, which stood still for" in ride.output, ride.output
@@ -208,43 +218,51 @@ def test_a_ride_that_stands_still(tmp_path: Path, scan: Path, still: int, whole:
 
 @pytest.mark.slow
 def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, scan: Path) -> None:
-    ride = None
-    with served(scan, 20, 60, 40):
-        ride = Ride(tmp_path, "--no-live", **_views(300))
-        ride.wait_for(lambda: ride.frames() > 20)
-    time.sleep(1)
-    with served(scan, 20, 40, 1):
-        assert ride.end() == 5
-    assert "its server has gone" in ride.output and "began anew at" in ride.output
+    n = 120
+    with ExitStack() as stack:
+        with served(scan, 20) as start:
+            ride = stack.enter_context(RideProgram(tmp_path, IMAGE, "--no-live", **_views(n)))
+            start()
+            ride.wait_for(lambda: ride.frames() > 20)
+        ride.wait_for(lambda: "its server has gone" in ride.output)
+        with served(scan, 20) as start:
+            start()
+            assert ride.end() == 5
+    assert "began anew at" in ride.output
     first, second = stored(tmp_path)
     assert first.status == "failed" and second.status == "complete" and second.ids[0] < 60  # found again soon
-    assert np.array_equal(second.ids, second.ids[0] + np.arange(300))
+    assert np.array_equal(second.ids, second.ids[0] + np.arange(n))
     for file in (first, second):
         _equal_to_the_bit(file, scan)
 
 
-@pytest.mark.parametrize("ring", [2048.0, 20.0])
+@pytest.mark.parametrize("ring", [2048.0, 5.0])
 @pytest.mark.slow
 def test_a_disk_of_5_mb_s(tmp_path: Path, scan: Path, ring: float) -> None:
-    """Frames of 0.69 MB at 20 a second: 13.8 MB/s. A ring that is large enough loses none."""
-    with h5py.File(scan) as file, h5py.File(tmp_path / "large.h5", "w") as large:
-        large["/exchange/data"] = np.array([zoom(each, 4, order=0) for each in file["/exchange/data"][:30]])
-    with served(tmp_path / "large.h5", 20, 20, 45):
-        program = DISK.format(bytes_per_s=5e6)
-        ride = Ride(tmp_path, "--no-live", program=program, ring_mb=ring, period_s=0.05, **_views(300))
+    """Frames of 173 kB at 80 a second: 13.8 MB/s. A ring that is large enough loses none. A small one is full after
+    6 s, and so are the 128 frames of the recorder."""
+    n, fps, source = 500, 80, tmp_path / "large.h5"
+    with h5py.File(scan) as file, h5py.File(source, "w") as large:
+        large["/exchange/data"] = file["/exchange/data"][:].repeat(2, 1).repeat(2, 2)
+    options: dict[str, Any] = {"program": DISK.format(bytes_per_s=5e6), "ring_mb": ring, "period_s": 1 / fps}
+    with served(source, fps) as start, RideProgram(tmp_path, IMAGE, "--no-live", **options, **_views(n)) as ride:
+        start()
         code = ride.end()
     (file,) = stored(tmp_path)
-    _equal_to_the_bit(file, tmp_path / "large.h5")
-    assert file.missing == sorted({*range(300)} - {*(file.ids - 1).tolist()})
-    assert code in (0, 7) or "memory for waiting frames was full: the disk is too slow" in ride.output, ride.output
+    _equal_to_the_bit(file, source)
+    _on_schedule(file, fps)
+    assert file.missing == sorted({*range(n)} - {*(file.ids - 1).tolist()})
     if ring > 1000:
-        assert not file.missing
+        assert code in (0, 7) and not file.missing, ride.output
+    else:
+        assert code == 5 and file.missing, ride.output
+        assert "memory for waiting frames was full: the disk is too slow" in ride.output
 
 
 @pytest.mark.slow
 def test_a_ride_that_is_killed_is_recovered(tmp_path: Path, scan: Path) -> None:
-    with served(scan, 20, 40, 40):
-        ride = Ride(tmp_path, "--no-live", **_views(600))
+    with served(scan, 20) as start, RideProgram(tmp_path, IMAGE, "--no-live", **_views(600)) as ride:
+        start()
         ride.wait_for(lambda: ride.frames() > 30)
         committed = ride.frames()
         ride.process.kill()
@@ -271,8 +289,11 @@ def test_large_frames_for_a_minute(tmp_path: Path, record_property: Callable[[st
     noise = np.random.default_rng(0).integers(0, 2**16, (13, 2048, 2048), dtype=np.uint16)  # another one each time
     with h5py.File(tmp_path / "large.h5", "w") as file:
         file["/exchange/data"] = noise
-    with served(tmp_path / "large.h5", 10, n / 10 + 4, 45):
-        ride = Ride(tmp_path, "--no-live", period_s=0.1, **_views(n))
+    with (
+        served(tmp_path / "large.h5", 10) as start,
+        RideProgram(tmp_path, IMAGE, "--no-live", period_s=0.1, **_views(n)) as ride,
+    ):
+        start()
         process, most, cpu = psutil.Process(ride.process.pid), 0.0, 0.0
         while ride.process.poll() is None:
             try:

@@ -15,7 +15,7 @@ def show(value: pvaccess.PvObject) -> None:
     if not value["value"][0]:
         return
     width, height = (each["size"] for each in value["dimension"])
-    kind = next(each["value"][0]["value"] for each in value["attribute"] if each["name"] == "Kind")
+    kind = next((each["value"][0]["value"] for each in value["attribute"] if each["name"] == "Kind"), "-")
     pixels = value["value"][0]["ushortValue"]
     print(value["uniqueId"], zlib.crc32(pixels.tobytes()), width, height, kind, flush=True)
 

@@ -247,6 +247,22 @@ def test_the_time_to_the_volume_of_a_stopped_scan_counts_from_the_signal() -> No
     assert ends()
 
 
+def test_how_long_the_volume_of_a_stopped_scan_is_waited_for_is_said_at_once_and_every_5_s() -> None:
+    seconds, told = 100.0, list[str]()
+    stop = StopRequest(now=lambda: seconds)
+    aborting = live_process.told_while_it_ends(stop, told.append)
+    assert not aborting() and not told
+    stop.stop()
+    for after in (0.5, 1.0, 5.0, 5.6):
+        seconds = 100.0 + after
+        assert not aborting()
+    waiting = "Waiting for the live volume of the views so far"
+    assert [text.split(".")[0] for text in told] == [f"{waiting}: {n} of at most 124 s" for n in (0, 6)]
+    stop.abort()
+    seconds = 200.0
+    assert aborting() and len(told) == 2
+
+
 def test_a_scan_with_enough_views_waits_for_its_volume(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_process, "ASK_LIVE_AFTER", 0.0)
     fits = """
