@@ -14,11 +14,12 @@ from recon import Grid
 from splatline_structure.intervals import CAUSES, Found, Interval
 from splatline_structure.materials import F32
 from splatline_structure.numbers import Structure
+from splatline_structure.volumes import Part
 
 _STEPS = 60  # of a curve of sizes
 
 
-def pictures_of(found: Found, volume: F32, grid: Grid) -> list[Picture]:
+def pictures_of(found: Found, volume: F32, grid: Grid, part: Part) -> list[Picture]:
     """All pictures of a page."""
     structures = [found.structure, *found.parts]
     drawn = {
@@ -26,7 +27,7 @@ def pictures_of(found: Found, volume: F32, grid: Grid) -> list[Picture]:
         "Sizes": ("Share of the volume of whole particles below a diameter.", sizes(structures)),
         "Profiles": (
             "Share of the particles' material, with a band by halves of the views.",
-            profiles(structures, grid),
+            profiles(found, grid, part),
         ),
         "What decides": ("Half-width of each number's interval, by cause.", causes(found.intervals)),
     }
@@ -61,17 +62,21 @@ def sizes(structures: Sequence[Structure]) -> bytes:
     whole = [each.particles.diameter[~each.particles.cut] for each in structures]
     largest = max((float(each.max()) for each in whole if each.size), default=1.0)
     at = np.linspace(0, largest, _STEPS)
-    curves = [np.array([(d[d <= x] ** 3).sum() for x in at]) / max(float((d**3).sum()), 1e-30) for d in whole]
-    _banded(axes, at, curves)
+    _banded(axes, at, [np.array([(d[d <= x] ** 3).sum() for x in at]) / max(float((d**3).sum()), 1e-30) for d in whole])
     finish(axes, "equivalent diameter (µm)", "share of the volume", f"{whole[0].size} whole particles", grid=True)
     return png(figure)
 
 
-def profiles(structures: Sequence[Structure], grid: Grid) -> bytes:
-    """The share of the particles' material along z, and in rings around the middle."""
+def profiles(found: Found, grid: Grid, part: Part) -> bytes:
+    """The share of the particles' material along z (of all slices in grey), and in rings around the middle."""
+    structures = [found.structure, *found.parts]
     figure = new_figure((WIDTH, 2.8))
     left, right = np.ravel(figure.subplots(1, 2, sharey=True))
-    _banded(left, grid.coordinates()[0], [each.along_z for each in structures])
+    z = grid.coordinates()[0]
+    if found.along_all is not None:
+        all_z = z[0] + grid.spacing[0] * (np.arange(part.asked.start, part.asked.stop) - part.slices.start)
+        left.plot(all_z, found.along_all, color="0.6")
+    _banded(left, z, [each.along_z for each in structures])
     finish(left, "z (mm)", "share", grid=True)
     _banded(right, structures[0].radial[1], [each.radial[0] for each in structures])
     finish(right, "from the middle (µm)", "", grid=True)

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from grain_scenes import Scene
 
+import recon
 from beamline import api
 from splatline_structure import pictures, volumes
-from splatline_structure.volumes import box_in
+from splatline_structure.volumes import box_in, parts_of, read_volume
 from tests.beamline.cli.small_scan import beamline, left
 
 SCENE = Scene(5, views=64, size=14, columns=48, rows=16, photons=1e5)
@@ -49,6 +50,23 @@ def test_halves_of_the_volumes_own_scan_are_made(here: Path) -> None:
 
 
 @pytest.mark.slow
+def test_halves_of_some_slices_are_those_of_their_rows(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By FBP, which takes each row for itself, they have the bits of whole halves; only rows near them are read."""
+    assert beamline("recon", "scan.h5", "-m", "fbp", "--no-report", "-o", "v.h5").exit_code == 0
+    monkeypatch.setattr(volumes, "_BESIDE", 2)
+    shapes, reconstruct = [], recon.reconstruct
+    monkeypatch.setattr(
+        volumes.recon, "reconstruct", lambda data, *of, **by: shapes.append(data.shape) or reconstruct(data, *of, **by)
+    )
+    whole, middle = (read_volume(Path("v.h5"), None, None, part, 10**9, True) for part in (None, (3, 12)))
+    scan = Path("scan.h5")
+    all_, some = (parts_of(part, scan, 2, pytest.fail, lambda *_: None) for part in (whole, middle))
+    assert [shape[1] for shape in shapes] == [16, 16, 13, 13]
+    for one, other in zip(all_, some, strict=True):
+        np.testing.assert_array_equal(one[3:12], other)
+
+
+@pytest.mark.slow
 def test_halves_of_a_scan_without_pixel_size_are_in_the_volumes_unit(here: Path) -> None:
     """They were 1/mm beside a volume in 1/px, and thresholds lay off by 27 gaps of levels."""
     with h5py.File("scan.h5", "r+") as file:
@@ -68,7 +86,7 @@ def test_intervals_against_views_are_wider_for_fewer_in_one_box_about_one_axis(
         api, "reconstruct", lambda *at, **of: axes.append(of["selection"].axis_col) or reconstruct(*at, **of)
     )
     words = ("-m", "fbp", "--number", "fraction_2", "--number", "surface")
-    result = beamline("structure-study", "scan.h5", "--views", "16,64", *words)
+    result = beamline("study", "structure", "scan.h5", "--views", "16,64", *words)
     assert result.exit_code == 0, result.output
     with (here / "scan_views/numbers.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -85,7 +103,7 @@ def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(api, "reconstruct", None)
-    result = beamline("structure-study", "scan.h5", "--views", "16,64", "--number", "fraction_3")
+    result = beamline("study", "structure", "scan.h5", "--views", "16,64", "--number", "fraction_3")
     assert (
         result.exit_code == 2 and "--number fraction_3: expected one of fraction_1, fraction_2, surf" in result.stderr
     )
@@ -94,6 +112,6 @@ def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
 
 @pytest.mark.parametrize(("views", "words"), [("8,64", "16 views or more"), ("many", "invalid literal")])
 def test_views_that_cannot_be_parted_are_refused(here: Path, views: str, words: str) -> None:
-    result = beamline("structure-study", "scan.h5", "--views", views)
+    result = beamline("study", "structure", "scan.h5", "--views", views)
     assert result.exit_code == 2 and words in result.stderr
     assert left(here) == {"scan.h5"}
