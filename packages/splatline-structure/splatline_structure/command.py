@@ -12,7 +12,7 @@ from beamline.cli.options import json_option, parsed
 from beamline.cli.terminal import Answer, answering
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import atomic_file, refuse_existing
-from beamline.core.text import memory_size, safe_name
+from beamline.core.text import count, memory_size, safe_name
 
 if TYPE_CHECKING:
     from splatline_structure.intervals import Found
@@ -166,10 +166,11 @@ def measured(path: Path, part: Part, box: Box, answer: Answer, **values: Any) ->
     from splatline_structure.intervals import found_in
     from splatline_structure.numbers import Rules
 
-    count, particles = values["materials"], values["particles"] or values["materials"]
-    if max(particles, values["through"]) > count:
+    n_materials, particles = values["materials"], values["particles"] or values["materials"]
+    if max(particles, values["through"]) > n_materials:
         raise ConfigError(
-            f"Material {max(particles, values['through'])} of {count}: they are numbered from 1. Nothing was written."
+            f"Material {max(particles, values['through'])} of {n_materials}: they are numbered from 1. Nothing was "
+            "written."
         )
     grid, data, parts = part.record.grid.part(*box), part.record.volume.data, []
     for half in _parts(path, part, answer, **values):
@@ -179,7 +180,7 @@ def measured(path: Path, part: Part, box: Box, answer: Answer, **values: Any) ->
     rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
     dz, dy, dx = (1e3 * edge for edge in grid.spacing)
     volume = np.ascontiguousarray(data[box])
-    found = found_in(volume, parts, count, (dz, dy, dx), rules, answer.counting("structures"))
+    found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("structures"))
     return Seen(path, part, box, grid, volume, found)
 
 
@@ -241,8 +242,8 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
         shown = [*(Picture("Numbers of all volumes", "Values with their intervals.", each) for each in drawn), *shown]
     particles = first.found.structure.particles
     undecided = (
-        f"{first.found.undecided:.1%} of the voxels are undecided; {particles.label.size} particles, "
-        f"{int(particles.cut.sum())} cut by a face of the box."
+        f"{first.found.undecided:.1%} of the voxels are undecided; "
+        f"{count(particles.label.size, 'particle')}, {int(particles.cut.sum())} cut by a face of the box."
     )
     limits = [f"{each.path}: {each.part.limit}" for each in seen if each.part.limit]
     texts = {
@@ -257,5 +258,6 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
     }
     with atomic_file(output) as partial:
         results.write_all(partial, texts, labels, first.part.record, first.grid)
-    lines = results.lines_of(table)
-    answer.done({"output": output, **states[0]}, title, *lines, undecided, *limits, f"output  {output}")
+    answer.done(
+        {"output": output, **states[0]}, title, *results.lines_of(table), undecided, *limits, f"output  {output}"
+    )

@@ -69,7 +69,7 @@ class Interval:
     @property
     def words(self) -> str:
         """What the interval comes from, or why there is none."""
-        return self.why_not or CAUSES[self.decides]
+        return self.why_not or (CAUSES[self.decides] if getattr(self, self.decides) > 0 else "nothing moves this")
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,25 +13,25 @@ from beamline.report.html import Picture
 from recon import Grid
 from splatline_structure.intervals import CAUSES, Found, Interval
 from splatline_structure.materials import F32
-from splatline_structure.numbers import Structure
 from splatline_structure.volumes import Part
-
-_STEPS = 60  # of a curve of sizes
 
 
 def pictures_of(found: Found, volume: F32, grid: Grid, part: Part) -> list[Picture]:
     """All pictures of a page."""
-    structures = [found.structure, *found.parts]
+    band = ", halves of the views as a band" * bool(found.parts)
     drawn = {
         "Materials": ("The middle slice, its labels (undecided: red), and particles.", slices(found, volume, grid)),
-        "Sizes": ("Share of the volume of whole particles below a diameter.", sizes(structures)),
+        "Sizes": (
+            f"Share of the volume of whole particles below a diameter{band}; lines: intervals of the sizes.",
+            b"" if found.structure.particles.cut.all() else sizes(found),
+        ),
         "Profiles": (
-            "Share of the particles' material, with a band by halves of the views.",
+            f"Share of the particles' material{band}{'; grey: of all slices' if part.limit else ''}.",
             profiles(found, grid, part),
         ),
-        "What decides": ("Half-width of each number's interval, by cause.", causes(found.intervals)),
+        "What decides": ("Half-width of the interval of each number that is determined.", causes(found.intervals)),
     }
-    return [Picture(title, caption, image) for title, (caption, image) in drawn.items()]
+    return [Picture(title, caption, image) for title, (caption, image) in drawn.items() if image]
 
 
 def slices(found: Found, volume: F32, grid: Grid) -> bytes:
@@ -55,14 +55,16 @@ def slices(found: Found, volume: F32, grid: Grid) -> bytes:
     return png(figure)
 
 
-def sizes(structures: Sequence[Structure]) -> bytes:
-    """Cumulative curves of volume over diameter, of whole particles."""
+def sizes(found: Found) -> bytes:
+    """Cumulative curves of volume over diameter, of whole particles, with the intervals of quantiles."""
     figure = new_figure((WIDTH, 3.2))
     axes = figure.subplots()
-    whole = [each.particles.diameter[~each.particles.cut] for each in structures]
-    largest = max((float(each.max()) for each in whole if each.size), default=1.0)
-    at = np.linspace(0, largest, _STEPS)
+    whole = [each.particles.diameter[~each.particles.cut] for each in (found.structure, *found.parts)]
+    at = np.linspace(0, max(float(each.max()) for each in whole if each.size), 60)
     _banded(axes, at, [np.array([(d[d <= x] ** 3).sum() for x in at]) / max(float((d**3).sum()), 1e-30) for d in whole])
+    shares = {percent / 100: found.intervals[f"size_{percent}"] for percent in (10, 50, 90)}
+    sure = {share: each for share, each in shares.items() if not each.why_not}
+    axes.hlines([*sure], [each.low for each in sure.values()], [each.high for each in sure.values()], "C1")
     finish(axes, "equivalent diameter (µm)", "share of the volume", f"{whole[0].size} whole particles", grid=True)
     return png(figure)
 
@@ -90,8 +92,8 @@ def _banded(axes: Any, at: NDArray[np.floating], curves: Sequence[NDArray[np.flo
 
 
 def causes(intervals: Mapping[str, Interval]) -> bytes:
-    """Bars of the half-widths by each cause, in per cent of the value."""
-    shown = {name: each for name, each in intervals.items() if np.isfinite(each.low) and each.value}
+    """Bars of the half-widths by each cause, in per cent of the value, of numbers that are determined."""
+    shown = {name: each for name, each in intervals.items() if not each.why_not and getattr(each, each.decides) > 0}
     figure = new_figure((WIDTH, 1.0 + 0.34 * max(len(shown), 1)))
     axes = figure.subplots()
     for k, cause in enumerate(CAUSES):
@@ -99,6 +101,7 @@ def causes(intervals: Mapping[str, Interval]) -> bytes:
         axes.barh(np.arange(len(shown)) + 0.2 * (k - 1.5), widths, 0.18, label=cause)
     axes.set_yticks(range(len(shown)), list(shown))
     axes.invert_yaxis()
+    axes.set(xscale="log", xlim=(0.01, None))  # fractions are some thousandths wide, sizes some tenths
     finish(axes, "half-width (% of the value)", "", size=8)
     return png(figure)
 
