@@ -37,7 +37,7 @@ FOR_PACKAGES = {
         "user_message",
     ),
     "beamline.core.files": ("parts_of", "refuse_existing", "text_in", "atomic_file", "write_together", "write_whole"),
-    "beamline.core.text": ("count", "csv_text", "safe_name", "size", "spans"),
+    "beamline.core.text": ("count", "csv_text", "memory_size", "safe_name", "size", "spans"),
     "beamline.core.quantities": ("VoxelKind",),
     "beamline.core.events": ("BlockDone", "BlockStarted", "Sink", "StateEntered", "Warned", "json_of"),
     "beamline.core.machine": ("free_memory",),

@@ -37,7 +37,8 @@ def refusal(line: str) -> str:
     command: click.Command | None = main
     context = click.Context(main, info_name="beamline")
     while isinstance(command, click.Group) and words and not words[0].startswith("-"):
-        name, *words = words
+        n = 2 if " ".join(words[:2]) in ADD_ONS else 1
+        name, words = " ".join(words[:n]), words[n:]
         command = command.get_command(context, name)
         if command is None:
             return "" if name in ADD_ONS else f"no command {name}"

@@ -49,6 +49,8 @@ def test_a_missing_add_on_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr("beamline.cli.main.commands", dict)
     said = CliRunner().invoke(main, ["tango"]).stderr
     assert "`beamline tango` needs a package that is not installed: pip install splatline-tango." in said
+    said = CliRunner().invoke(main, ["study", "structure", "SCAN"]).stderr
+    assert "`beamline study structure` needs a package that is not installed: pip install splatline-structure." in said
     with pytest.raises(ConfigError, match=r"--cluster needs a package that .* pip install splatline-cluster"):
         cluster("local:2")
     with pytest.raises(UnknownNameError, match="pip install splatline-tango"):

@@ -193,16 +193,19 @@ class LazyGroup(click.Group):
         return list(commands())
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        command = _command(cmd_name)
-        return None if command is None else command.load(cmd_name)
+        return command.load(cmd_name) if (command := _command(cmd_name)) else None
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Resolve a command as click does; the error for an unknown name suggests the nearest one."""
+        """Resolve a command as click does; the error for an unknown name suggests the nearest one.
+
+        Two words are one name where another package adds it, such as `study structure`.
+        """
         if args[:1] == ["doctor"]:  # its name in version 1.0
             click.echo("`beamline doctor` is now `beamline check CONFIG --connect`.", err=True)
             args = ["check", "--connect", *(word for word in args[1:] if word != "--session")]
+        args = [two, *args[2:]] if (two := " ".join(args[:2])) in ADD_ONS else args
         command = _command(args[0]) if args else None
         if args and command is None and args[0][:1] not in ("", "-"):
             if args[0] in ADD_ONS:

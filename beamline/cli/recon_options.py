@@ -23,6 +23,7 @@ from beamline.cli.options import (
 )
 from beamline.cli.recipe import DATA, METHOD, OUTPUT, RESOURCES, config_option, heading
 from beamline.cli.selection_options import selection_options
+from beamline.core.text import memory_size
 from beamline.storage.volumes import suffixes_text
 from recon.base.choices import AUTO
 from recon.base.registry import in_folders
@@ -30,14 +31,6 @@ from recon.methods import names
 
 if TYPE_CHECKING:
     from beamline.reconstruct.region import AroundSample, Region
-
-
-def memory_size(text: str) -> int:
-    """Parse a size such as 8G, 500M or 1.5GB (decimal units) to bytes. Raises ValueError for any other text."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT])B?", text.strip(), re.IGNORECASE)
-    if match is None or not float(match[1]) > 0:
-        raise ValueError(f"{text!r} is not a size; expected a number and K, M, G or T, such as 8G")
-    return round(float(match[1]) * 1000 ** (" KMGT".index(match[2].upper())))
 
 
 def cluster_of(text: str) -> str:

@@ -22,6 +22,14 @@ def size(n_bytes: float) -> str:
     return f"{n_bytes:.3g} TB"
 
 
+def memory_size(text: str) -> int:
+    """Parse a size such as 8G, 500M or 1.5GB (decimal units) to bytes. Raises ValueError for any other text."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([KMGT])B?", text.strip(), re.IGNORECASE)
+    if match is None or not float(match[1]) > 0:
+        raise ValueError(f"{text!r} is not a size; expected a number and K, M, G or T, such as 8G")
+    return round(float(match[1]) * 1000 ** (" KMGT".index(match[2].upper())))
+
+
 def rounded(value: float, *, up: bool = False) -> float:
     """A positive value rounded down (or up) to three digits, so that an advised limit holds; other values unchanged."""
     if not 0 < value < math.inf:
@@ -32,9 +40,11 @@ def rounded(value: float, *, up: bool = False) -> float:
 
 def printable(text: str) -> str:
     """The text for a terminal: control characters become `\\x1b` or `\\t`, except line ends, so that none acts."""
-    if text.isprintable():  # also where it has 50 MB
-        return text
-    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+    return (
+        text
+        if text.isprintable()  # also where it has 50 MB
+        else "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+    )
 
 
 SENTENCE = 10_000  # characters of the longest one that is shown in one line

@@ -27,7 +27,7 @@ ADD_ONS = {
     **dict.fromkeys(("area_detector", "publish", "ride"), "splatline-areadetector"),
     **dict.fromkeys(("intratomo", "naf", "sax-nerf"), "splatline-neural"),
     **dict.fromkeys(("render", "surface", "voxelise"), "splatline-models"),
-    **dict.fromkeys(("structure", "structure-study"), "splatline-structure"),
+    **dict.fromkeys(("structure", "study structure"), "splatline-structure"),
     "tango": "splatline-tango",
     **dict.fromkeys(("materials", "xafs"), "splatline-spectral"),
 }

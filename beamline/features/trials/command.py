@@ -182,7 +182,7 @@ def study(request: StudyRequest) -> None:
 
     fixed-views: 360, 180, 90 and 45 views, evenly spread. sector: 30-150, 45-135 and 60-120 degrees, at falling and at
     equal numbers of views. random: views at random beside evenly spread ones. window-average: means of neighbouring
-    views, side by side and overlapping.
+    views, side by side and overlapping. `study structure`: numbers of the microstructure (splatline-structure).
 
     Prints PSNR, SSIM, SNR and CNR of every row, PSNR and SSIM also against --truth. A row that asks for more views than
     the scan has is left out. Writes a folder with study.csv, pictures and report.html. Ctrl-C stops with

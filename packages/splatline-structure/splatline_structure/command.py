@@ -2,36 +2,44 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamline.cli.options import json_option
+from beamline.cli.options import json_option, parsed
 from beamline.cli.terminal import Answer, answering
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import atomic_file, refuse_existing
-from beamline.core.text import safe_name
+from beamline.core.text import count, memory_size, safe_name
 
 if TYPE_CHECKING:
     from splatline_structure.intervals import Found
-    from splatline_structure.volumes import Box
+    from splatline_structure.volumes import Box, Part
 
 _FILE = click.Path(path_type=Path)
-_SUFFIXES = {"h5": ".h5", "tif": ".tif", "zarr": ".zarr"}
-_FEWEST = 8  # views of each part
+FEWEST = 16  # views that can be parted, 8 of each half
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A volume that was read, and what was found in it."""
+    """A volume that was read, and what was found in it.
+
+    Attributes:
+        grid, volume: of the box.
+    """
 
     path: Path
-    record: Any
+    part: Part
+    box: Box
     grid: Any
     volume: Any
     found: Found
+
+    def voxels(self, slices: slice) -> str:
+        """The box in these slices of the volume, as text."""
+        return ",".join(f"{each.start}:{each.stop}" for each in (slices, *self.box[1:]))
 
 
 @click.command()
@@ -63,6 +71,9 @@ class Seen:
 @click.option("--quick", is_flag=True, help="Leave out what the views do to the numbers.")
 @click.option("--crop", type=click.Choice(["square", "none"]), default="square", show_default=True,
               help="square: inside the circle of the sample, or of the field, without a can's wall.")  # fmt: skip
+@click.option("--memory", metavar="SIZE", callback=parsed(memory_size),
+              help="For volumes, such as 8G. Of a larger one the slices in the middle that fit are looked at, and all "
+                   "for fractions and surface. Default: what is free.")  # fmt: skip
 @click.option("--slices", type=click.IntRange(0), nargs=2, metavar="FIRST END", help="Slices to take. Default: all.")
 @click.option(
     "--radius",
@@ -89,7 +100,7 @@ class Seen:
     help="Voxels of the central cube of the tortuosity; 0: none.",
 )
 @click.option(
-    "--labels", type=click.Choice(list(_SUFFIXES)), default="h5", show_default=True, help="Format of the labels."
+    "--labels", type=click.Choice(["h5", "tif", "zarr"]), default="h5", show_default=True, help="Format of the labels."
 )
 @click.option("-o", "--output", type=_FILE, help="New folder. Default: VOLUME's stem + _structure, here.")
 @json_option
@@ -125,14 +136,24 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
 
 def _seen(path: Path, answer: Answer, **values: Any) -> Seen:
     """One volume, and what was found in it."""
-    from splatline_structure.volumes import box_in, read_volume
+    from beamline.core.machine import free_memory
+    from splatline_structure.intervals import with_all_slices
+    from splatline_structure.volumes import box_in, read_volume, slabs_of
 
-    record = read_volume(path, values["dataset"], values["voxel_um"], values["slices"])
-    return measured(path, record, box_in(record.volume.data, values["crop"] == "square"), answer, **values)
+    memory = values["memory"] or free_memory()
+    crop = values["crop"] == "square"
+    part = read_volume(path, values["dataset"], values["voxel_um"], values["slices"], memory, crop)
+    if part.limit:
+        answer.warn(f"{path}: {part.limit}")
+    seen = measured(path, part, box_in(part.record.volume.data, crop), answer, **values)
+    if not part.limit:
+        return seen
+    slabs = slabs_of(path, values["dataset"], part, seen.box)
+    return replace(seen, found=with_all_slices(seen.found, slabs, answer.counting("slabs")))
 
 
-def measured(path: Path, record: Any, box: Box, answer: Answer, **values: Any) -> Seen:
-    """What was found in the volume of a record.
+def measured(path: Path, part: Part, box: Box, answer: Answer, **values: Any) -> Seen:
+    """What was found in the slices of a volume.
 
     Args:
         box: that is looked at, also in the volumes from parts of the views.
@@ -145,26 +166,26 @@ def measured(path: Path, record: Any, box: Box, answer: Answer, **values: Any) -
     from splatline_structure.intervals import found_in
     from splatline_structure.numbers import Rules
 
-    count, particles = values["materials"], values["particles"] or values["materials"]
-    if max(particles, values["through"]) > count:
+    n_materials, particles = values["materials"], values["particles"] or values["materials"]
+    if max(particles, values["through"]) > n_materials:
         raise ConfigError(
-            f"Material {max(particles, values['through'])} of {count}: they are numbered from 1. Nothing was written."
+            f"Material {max(particles, values['through'])} of {n_materials}: they are numbered from 1. Nothing was "
+            "written."
         )
-    grid, volume = record.grid.part(*box), np.ascontiguousarray(record.volume.data[box])
-    first, end = values["slices"] or (0, None)
-    parts = []
-    for part in _parts(path, record, answer, **values):
-        if part[first:end].shape != record.volume.data.shape:
-            raise ValueError(f"a part of its views has {part.shape} voxels")
-        parts.append(np.ascontiguousarray(part[first:end][box]))
+    grid, data, parts = part.record.grid.part(*box), part.record.volume.data, []
+    for half in _parts(path, part, answer, **values):
+        if half.shape != data.shape:
+            raise ValueError(f"a part of its views has {half.shape} voxels, not {data.shape}")
+        parts.append(np.ascontiguousarray(half[box]))
     rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
     dz, dy, dx = (1e3 * edge for edge in grid.spacing)
-    found = found_in(volume, parts, count, (dz, dy, dx), rules, answer.counting("structures"))
-    return Seen(path, record, grid, volume, found)
+    volume = np.ascontiguousarray(data[box])
+    found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("structures"))
+    return Seen(path, part, box, grid, volume, found)
 
 
-def _parts(path: Path, record: Any, answer: Answer, **values: Any) -> list[Any]:
-    """The volume from each half of its views; none where they are not asked for, or not there."""
+def _parts(path: Path, part: Part, answer: Answer, **values: Any) -> list[Any]:
+    """The slices of the volume from each half of its views; none where they are not asked for, or not there."""
     from beamline.storage.volumes.files import opened_volume
     from splatline_structure.volumes import parts_of
 
@@ -172,20 +193,20 @@ def _parts(path: Path, record: Any, answer: Answer, **values: Any) -> list[Any]:
         return []
     if values["parts"]:
         halves = []
-        for part in values["parts"]:
-            with opened_volume(part) as opened:
-                halves.append(opened.volume.data[: opened.grid.shape[0]])
+        for half in values["parts"]:
+            with opened_volume(half) as opened:
+                halves.append(opened.volume.data[part.slices if opened.grid.shape[0] == part.count else slice(None)])
         return halves
-    scan = values["scan"] or Path(record.raw_file)
+    scan = values["scan"] or Path(part.record.raw_file)
     if not scan.is_file():
         answer.warn(
             f"{path}: its scan is not there ({scan}): the intervals are without what the views do. Give --scan or "
             "--parts."
         )
         return []
-    if int(record.parameters.get("n_views", 2 * _FEWEST)) < 2 * _FEWEST:
-        raise ValueError(f"{record.parameters['n_views']} views are too few to be parted: give --quick")
-    return parts_of(record, scan, 2, answer.warn, answer.counting("halves of the views"))
+    if (n_views := int(part.record.parameters.get("n_views", FEWEST))) < FEWEST:
+        raise ValueError(f"{n_views} views are too few to be parted: give --quick")
+    return parts_of(part, scan, 2, answer.warn, answer.counting("halves of the views"))
 
 
 def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any], answer: Answer) -> None:
@@ -196,38 +217,47 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
 
     first = seen[0]
     table = first.found.intervals
-    shown = pictures.pictures_of(first.found, first.volume, first.grid)
-    title = f"Structure of {first.path.name}"
-    settings = {"volume": first.path, **{name: value for name, value in values.items() if value is not None}}
-    settings["command"] = " ".join(("beamline structure", *(str(each.path) for each in seen)))
-    states = [results.facts_of(each.found, {**settings, "volume": each.path}) for each in seen]
+    shown = pictures.pictures_of(first.found, first.volume, first.grid, first.part)
+    title = f"{seen[1].path.name} less {first.path.name}" if compare else f"Structure of {first.path.name}"
+    settings = {
+        "volume": first.path,
+        **{name: value for name, value in values.items() if value is not None},
+        "command": " ".join(("beamline structure", *(str(each.path) for each in seen))),
+    }
+    states = [
+        results.facts_of(each.found, {**settings, "volume": each.path, "box": each.voxels(each.part.slices)})
+        for each in seen
+    ]
     if compare:
         other = seen[1].found.intervals
-        table = {name: difference(each, other[name]) for name, each in table.items()}
-        title = f"{seen[1].path.name} less {first.path.name}"
+        table = {name: difference(each, other[name]) for name, each in table.items() if name in other}
     if len(seen) > 1:
-        names = [name for name, each in first.found.intervals.items() if not each.why_not]
-        curves = {name: [each.found.intervals[name] for each in seen] for name in names}
-        at = [float(each.record.parameters.get("time_s", k)) for k, each in enumerate(seen)]
-        drawn = pictures.curves_of(curves, at, "volume") if curves else None
-        shown = [*([Picture("Numbers of all volumes", "Values with their intervals.", drawn)] if drawn else []), *shown]
-    found = first.found
-    particles = found.structure.particles
+        curves = {
+            name: [each.found.intervals[name] for each in seen]
+            for name, interval in first.found.intervals.items()
+            if not interval.why_not and all(name in each.found.intervals for each in seen)
+        }
+        at = [float(each.part.record.parameters.get("time_s", k)) for k, each in enumerate(seen)]
+        drawn = [pictures.curves_of(curves, at, "volume")] if curves else []
+        shown = [*(Picture("Numbers of all volumes", "Values with their intervals.", each) for each in drawn), *shown]
+    particles = first.found.structure.particles
     undecided = (
-        f"{found.undecided:.1%} of the voxels are undecided; {particles.label.size} particles, "
-        f"{int(particles.cut.sum())} cut by a face of the box."
+        f"{first.found.undecided:.1%} of the voxels are undecided; "
+        f"{count(particles.label.size, 'particle')}, {int(particles.cut.sum())} cut by a face of the box."
     )
+    limits = [f"{each.path}: {each.part.limit}" for each in seen if each.part.limit]
     texts = {
-        "report.html": results.page(title, undecided, [], shown, table, settings),
-        "numbers.csv": results.numbers_table(table),
+        "report.html": results.page(title, undecided, limits, shown, table, settings),
+        "numbers.csv": results.numbers_table(table, *map(first.voxels, (first.part.slices, first.part.asked))),
         "structure.json": results.json_text(states[0] if len(seen) == 1 else {"states": states}),
         "particles.csv": results.particles_table(particles, first.grid),
     }
-    suffix = _SUFFIXES[values["labels"]]
     labels: dict[str, Any] = {
-        f"materials{suffix}": found.structure.labels + 1,
-        f"particles{suffix}": found.structure.numbered,
+        f"materials.{values['labels']}": first.found.structure.labels + 1,
+        f"particles.{values['labels']}": first.found.structure.numbered,
     }
     with atomic_file(output) as partial:
-        results.write_all(partial, texts, labels, first.record, first.grid)
-    answer.done({"output": output, **states[0]}, title, *results.lines_of(table), undecided, f"output  {output}")
+        results.write_all(partial, texts, labels, first.part.record, first.grid)
+    answer.done(
+        {"output": output, **states[0]}, title, *results.lines_of(table), undecided, *limits, f"output  {output}"
+    )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatline_structure.materials import F32, Materials, materials_of, probabilities
-from splatline_structure.numbers import Rules, Structure, coarse, structure_of
+from splatline_structure.materials import F32, F64, Materials, labelled, materials_of, probabilities
+from splatline_structure.numbers import Rules, Structure, coarse, shares_of, structure_of
 from splatline_structure.particles import Particles, Spacing
 
 Told = Callable[[int, int], None]
@@ -69,7 +69,7 @@ class Interval:
     @property
     def words(self) -> str:
         """What the interval comes from, or why there is none."""
-        return self.why_not or CAUSES[self.decides]
+        return self.why_not or (CAUSES[self.decides] if getattr(self, self.decides) > 0 else "nothing moves this")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +82,8 @@ class Found:
         unsure: bool [z, y, x], these voxels.
         parts: structures of volumes from parts of the views.
         off: share of a gap of levels by which thresholds may lie off.
+        spacing: edges of a voxel (z, y, x), µm.
+        along_all: share of the particles' material in each slice, also of those beyond the ones looked at.
     """
 
     structure: Structure
@@ -91,6 +93,9 @@ class Found:
     unsure: np.ndarray
     parts: tuple[Structure, ...]
     off: float
+    rules: Rules
+    spacing: Spacing
+    along_all: F64 | None = None
 
 
 def found_in(
@@ -129,13 +134,13 @@ def found_in(
     dz, dy, dx = spacing
     wide = structure_of(coarse(volume), materials.thresholds, (2 * dz, 2 * dy, 2 * dx), rules.of_coarse_voxels).numbers
     tell(steps, steps)
-    errors = float((np.hypot(materials.errors[1:], materials.errors[:-1]) / gaps).max())
-    off = math.hypot(PARTIAL, errors, LEVELS_MOVE * float(np.mean(moved)))
+    errors = np.hypot(materials.errors[1:], materials.errors[:-1]) / gaps
+    off = math.hypot(PARTIAL, float(errors.max()), LEVELS_MOVE * float(np.mean(moved)))
     unsure = probabilities(volume, materials.thresholds, float(materials.spread.max())).max(axis=0) < SURE
     undecided = float(unsure.mean())
     if undecided > UNDECIDED:
         why = f"{undecided:.0%} of the voxels could be of either material: more views or photons are needed"
-    made = {
+    intervals = {
         name: Interval(value, why_not=why)
         if why
         else _interval(
@@ -149,7 +154,7 @@ def found_in(
         )
         for name, value in whole.numbers.items()
     }
-    return Found(whole, materials, made, undecided, unsure, tuple(halves), off)
+    return Found(whole, materials, intervals, undecided, unsure, tuple(halves), off, rules, spacing)
 
 
 def _of_particles(name: str, particles: Particles) -> float:
@@ -184,21 +189,42 @@ def _interval(
     voxels = of_voxels * abs(wide - value)
     half = max(math.hypot(np.nan_to_num(views), levels, voxels, of_particles), NARROWEST * abs(value))
     middle = value + float(np.nan_to_num(moves))
-    low, high = max(middle - half, float(kind == "tortuosity")), middle + half
-    if kind in _SHARES:
-        high = min(high, 1.0)
-    why = ""
-    if high - low > WIDEST * abs(value):
-        why = f"the interval is {low:.3g} to {high:.3g}, wider than half of the value"
-    return Interval(value, low, high, moves, views, levels, voxels, of_particles, why)
+    low = max(middle - half, float(kind == "tortuosity"))
+    return _within(kind, Interval(value, low, middle + half, moves, views, levels, voxels, of_particles))
+
+
+def _within(kind: str, interval: Interval) -> Interval:
+    """The interval of a share ends at 1; one that is too wide determines nothing."""
+    low, high = interval.low, min(interval.high, 1.0) if kind in _SHARES else interval.high
+    why = f"the interval is {low:.3g} to {high:.3g}, wider than half of the value"
+    return replace(interval, high=high, why_not=why if high - low > WIDEST * abs(interval.value) else "")
+
+
+def with_all_slices(found: Found, slabs: Iterable[F32], tell: Told = lambda n, of: None) -> Found:
+    """With fractions and surface of all slices, named `_all`: intervals are as wide as those of the middle ones.
+
+    Args:
+        slabs: all slices, some at a time.
+        tell: gets slabs taken.
+    """
+    numbers, along = list[Numbers](), list[F64]()
+    for slab in slabs:
+        labels = labelled(slab, found.materials.thresholds)
+        numbers.append(shares_of(labels, found.materials.levels.size, found.spacing, found.rules))
+        along.append((labels == found.rules.particles - 1).mean(axis=(1, 2)))
+        tell(len(along), 0)
+    intervals = dict(found.intervals)
+    for name in numbers[0]:
+        value = float(np.average([each[name] for each in numbers], weights=list(map(len, along))))
+        off = value - (middle := found.intervals[name]).value
+        moved = replace(middle, value=value, low=max(middle.low + off, 0.0), high=middle.high + off)
+        intervals[f"{name}_all"] = moved if moved.why_not else _within(name.split("_")[0], moved)
+    return replace(found, intervals=intervals, along_all=np.concatenate(along))
 
 
 def difference(one: Interval, other: Interval) -> Interval:
     """Of two states: the second less the first, with the intervals' half-widths added in squares."""
-    value = other.value - one.value
-    if one.why_not or other.why_not:
-        return Interval(value, why_not=one.why_not or other.why_not)
+    value, middle = other.value - one.value, (other.high + other.low - one.high - one.low) / 2
     half = math.hypot((one.high - one.low) / 2, (other.high - other.low) / 2)
-    middle = (other.high + other.low - one.high - one.low) / 2
-    alike = "no change is told from none" if middle - half < 0 < middle + half else ""
-    return Interval(value, middle - half, middle + half, why_not=alike)
+    alike = "no change is told from none" if abs(middle) < half else ""
+    return Interval(value, middle - half, middle + half, why_not=one.why_not or other.why_not or alike)

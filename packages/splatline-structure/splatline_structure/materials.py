@@ -119,6 +119,6 @@ def probabilities(volume: F32, thresholds: F64, deviation: F32 | float) -> F32:
     Args:
         deviation: standard deviation of the error, of each voxel or of all.
     """
-    below = [ndtr((threshold - volume) / deviation) for threshold in thresholds]
+    below = (ndtr((threshold - volume) / deviation) for threshold in thresholds)
     edges = [np.zeros_like(volume), *below, np.ones_like(volume)]
     return np.stack([high - low for low, high in pairwise(edges)]).astype(np.float32)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -62,7 +64,7 @@ class Structure:
 
 def unit_of(name: str) -> str:
     """The unit of a number; empty for shares, counts and factors."""
-    return "1/µm" if name == "surface" else "µm" if name.startswith("size") else ""
+    return "1/µm" if name.startswith("surface") else "µm" if name.startswith("size") else ""
 
 
 def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -> Structure:
@@ -78,15 +80,11 @@ def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -
     numbered = parted(cleaned(mask, rules.radius, rules.smallest), rules.neck)
     particles = measured(numbered, spacing)
     whole, inside = ~particles.cut, numbered > 0
-    shares = np.bincount(labels.ravel(), minlength=len(thresholds) + 1) / labels.size
-    numbers = {f"fraction_{k}": float(share) for k, share in enumerate(shares, 1)}
-    numbers["surface"] = float(surfaces(mask.astype(np.uint8), spacing, goes_on=True)[-1]) / (
-        mask.size * math.prod(spacing)
-    )
+    numbers = shares_of(labels, len(thresholds) + 1, spacing, rules)
     numbers |= {f"size_{share}": particles.quantile(share / 100) for share in (10, 50, 90)}
-    numbers["sphericity"] = _median(particles.sphericity[whole])
-    numbers["contacts"] = _mean(np.array([len(each) for each in particles.neighbours])[whole])
-    numbers["cracks"] = _mean(~mask[inside])
+    numbers["sphericity"] = _of(particles.sphericity[whole], np.median)
+    numbers["contacts"] = _of(np.array([len(each) for each in particles.neighbours])[whole])
+    numbers["cracks"] = _of(~mask[inside])
     through = labels == rules.through - 1
     for axis, name in enumerate("zyx"):
         share = int(connecting(through, axis).sum()) / max(int(through.sum()), 1)
@@ -94,6 +92,13 @@ def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -
         if rules.side:
             numbers[f"tortuosity_{name}"] = tortuosity(central(through, rules.side), axis)
     return Structure(labels, numbered, particles, numbers, mask.mean(axis=(1, 2)), _radial(mask, spacing))
+
+
+def shares_of(labels: Labels, count: int, spacing: Spacing, rules: Rules) -> dict[str, float]:
+    """Fractions of `count` materials, and the surface of the particles' one: what slabs of a volume add up to."""
+    shares, mask = np.bincount(labels.ravel(), minlength=count) / labels.size, labels == rules.particles - 1
+    surface = float(surfaces(mask.astype(np.uint8), spacing, goes_on=True)[-1]) / (mask.size * math.prod(spacing))
+    return {**{f"fraction_{k}": float(share) for k, share in enumerate(shares, 1)}, "surface": surface}
 
 
 def coarse(volume: F32) -> F32:
@@ -111,9 +116,5 @@ def _radial(mask: np.ndarray, spacing: Spacing) -> tuple[F64, F64]:
     return share, (np.arange(ring.max() + 1) + 0.5) * 2 * spacing[2]
 
 
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if values.size else math.nan
-
-
-def _median(values: F64) -> float:
-    return float(np.median(values)) if values.size else math.nan
+def _of(values: np.ndarray, take: Callable[[np.ndarray], Any] = np.mean) -> float:
+    return float(take(values)) if values.size else math.nan

@@ -125,7 +125,7 @@ def measured(labels: Numbers, spacing: Spacing = (1, 1, 1), origin: Spacing = (0
     counts = np.bincount(labels.ravel())
     number = np.flatnonzero(counts[1:]) + 1
     centroid = np.array(ndimage.center_of_mass(labels > 0, labels, number)).reshape(-1, 3) * spacing + origin
-    faces = [np.moveaxis(labels, axis, 0)[[0, -1]].ravel() for axis in range(3)]
+    faces = np.concatenate([np.moveaxis(labels, axis, 0)[[0, -1]].ravel() for axis in range(3)])
     touching: dict[int, set[int]] = {each: set() for each in number.tolist()}
     for axis in range(3):
         line = np.moveaxis(labels, axis, 0)
@@ -136,7 +136,7 @@ def measured(labels: Numbers, spacing: Spacing = (1, 1, 1), origin: Spacing = (0
     return Particles(
         number.astype(np.int32), (counts[number] * math.prod(spacing)).astype(np.float64),
         surfaces(labels, spacing)[number], centroid,
-        np.isin(number, np.concatenate(faces)), tuple(tuple(sorted(touching[each])) for each in number.tolist()),
+        np.isin(number, faces), tuple(tuple(sorted(touching[each])) for each in number.tolist()),
     )  # fmt: skip
 
 

@@ -13,24 +13,25 @@ from beamline.report.html import Picture
 from recon import Grid
 from splatline_structure.intervals import CAUSES, Found, Interval
 from splatline_structure.materials import F32
-from splatline_structure.numbers import Structure
-
-_STEPS = 60  # of a curve of sizes
+from splatline_structure.volumes import Part
 
 
-def pictures_of(found: Found, volume: F32, grid: Grid) -> list[Picture]:
+def pictures_of(found: Found, volume: F32, grid: Grid, part: Part) -> list[Picture]:
     """All pictures of a page."""
-    structures = [found.structure, *found.parts]
+    band = ", halves of the views as a band" * bool(found.parts)
     drawn = {
         "Materials": ("The middle slice, its labels (undecided: red), and particles.", slices(found, volume, grid)),
-        "Sizes": ("Share of the volume of whole particles below a diameter.", sizes(structures)),
-        "Profiles": (
-            "Share of the particles' material, with a band by halves of the views.",
-            profiles(structures, grid),
+        "Sizes": (
+            f"Share of the volume of whole particles below a diameter{band}; lines: intervals of the sizes.",
+            b"" if found.structure.particles.cut.all() else sizes(found),
         ),
-        "What decides": ("Half-width of each number's interval, by cause.", causes(found.intervals)),
+        "Profiles": (
+            f"Share of the particles' material{band}{'; grey: of all slices' if part.limit else ''}.",
+            profiles(found, grid, part),
+        ),
+        "What decides": ("Half-width of the interval of each number that is determined.", causes(found.intervals)),
     }
-    return [Picture(title, caption, image) for title, (caption, image) in drawn.items()]
+    return [Picture(title, caption, image) for title, (caption, image) in drawn.items() if image]
 
 
 def slices(found: Found, volume: F32, grid: Grid) -> bytes:
@@ -54,24 +55,30 @@ def slices(found: Found, volume: F32, grid: Grid) -> bytes:
     return png(figure)
 
 
-def sizes(structures: Sequence[Structure]) -> bytes:
-    """Cumulative curves of volume over diameter, of whole particles."""
+def sizes(found: Found) -> bytes:
+    """Cumulative curves of volume over diameter, of whole particles, with the intervals of quantiles."""
     figure = new_figure((WIDTH, 3.2))
     axes = figure.subplots()
-    whole = [each.particles.diameter[~each.particles.cut] for each in structures]
-    largest = max((float(each.max()) for each in whole if each.size), default=1.0)
-    at = np.linspace(0, largest, _STEPS)
-    curves = [np.array([(d[d <= x] ** 3).sum() for x in at]) / max(float((d**3).sum()), 1e-30) for d in whole]
-    _banded(axes, at, curves)
+    whole = [each.particles.diameter[~each.particles.cut] for each in (found.structure, *found.parts)]
+    at = np.linspace(0, max(float(each.max()) for each in whole if each.size), 60)
+    _banded(axes, at, [np.array([(d[d <= x] ** 3).sum() for x in at]) / max(float((d**3).sum()), 1e-30) for d in whole])
+    shares = {percent / 100: found.intervals[f"size_{percent}"] for percent in (10, 50, 90)}
+    sure = {share: each for share, each in shares.items() if not each.why_not}
+    axes.hlines([*sure], [each.low for each in sure.values()], [each.high for each in sure.values()], "C1")
     finish(axes, "equivalent diameter (µm)", "share of the volume", f"{whole[0].size} whole particles", grid=True)
     return png(figure)
 
 
-def profiles(structures: Sequence[Structure], grid: Grid) -> bytes:
-    """The share of the particles' material along z, and in rings around the middle."""
+def profiles(found: Found, grid: Grid, part: Part) -> bytes:
+    """The share of the particles' material along z (of all slices in grey), and in rings around the middle."""
+    structures = [found.structure, *found.parts]
     figure = new_figure((WIDTH, 2.8))
     left, right = np.ravel(figure.subplots(1, 2, sharey=True))
-    _banded(left, grid.coordinates()[0], [each.along_z for each in structures])
+    z = grid.coordinates()[0]
+    if found.along_all is not None:
+        all_z = z[0] + grid.spacing[0] * (np.arange(part.asked.start, part.asked.stop) - part.slices.start)
+        left.plot(all_z, found.along_all, color="0.6")
+    _banded(left, z, [each.along_z for each in structures])
     finish(left, "z (mm)", "share", grid=True)
     _banded(right, structures[0].radial[1], [each.radial[0] for each in structures])
     finish(right, "from the middle (µm)", "", grid=True)
@@ -85,8 +92,8 @@ def _banded(axes: Any, at: NDArray[np.floating], curves: Sequence[NDArray[np.flo
 
 
 def causes(intervals: Mapping[str, Interval]) -> bytes:
-    """Bars of the half-widths by each cause, in per cent of the value."""
-    shown = {name: each for name, each in intervals.items() if np.isfinite(each.low) and each.value}
+    """Bars of the half-widths by each cause, in per cent of the value, of numbers that are determined."""
+    shown = {name: each for name, each in intervals.items() if not each.why_not and getattr(each, each.decides) > 0}
     figure = new_figure((WIDTH, 1.0 + 0.34 * max(len(shown), 1)))
     axes = figure.subplots()
     for k, cause in enumerate(CAUSES):
@@ -94,6 +101,7 @@ def causes(intervals: Mapping[str, Interval]) -> bytes:
         axes.barh(np.arange(len(shown)) + 0.2 * (k - 1.5), widths, 0.18, label=cause)
     axes.set_yticks(range(len(shown)), list(shown))
     axes.invert_yaxis()
+    axes.set(xscale="log", xlim=(0.01, None))  # fractions are some thousandths wide, sizes some tenths
     finish(axes, "half-width (% of the value)", "", size=8)
     return png(figure)
 

@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,15 +37,16 @@ def cells(name: str, interval: Interval) -> list[str]:
 
 def lines_of(intervals: Mapping[str, Interval]) -> list[str]:
     """The table for people."""
-    rows = [cells(name, each)[:6] for name, each in intervals.items()]
     return [
         f"{name:<14}{value:>15} {unit:<5}" + (f"{low} to {high}".ljust(20) if low else "") + f"  {words}"
-        for name, unit, value, low, high, words in rows
+        for name, unit, value, low, high, words, *_ in (cells(name, each) for name, each in intervals.items())
     ]
 
 
-def numbers_table(intervals: Mapping[str, Interval]) -> str:
-    return csv_text([list(COLUMNS), *(cells(name, each) for name, each in intervals.items())])
+def numbers_table(intervals: Mapping[str, Interval], box: str, box_of_all: str) -> str:
+    """All numbers as CSV, with the box of voxels that each is of."""
+    rows = [[*cells(name, each), box_of_all if name.endswith("_all") else box] for name, each in intervals.items()]
+    return csv_text([[*COLUMNS, "box"], *rows])
 
 
 def particles_table(particles: Particles, grid: Grid) -> str:
@@ -56,30 +56,23 @@ def particles_table(particles: Particles, grid: Grid) -> str:
     rows: list[Sequence[object]] = [head]
     for i in np.argsort(-particles.volume, kind="stable").tolist():
         sizes = particles.volume[i], particles.diameter[i], particles.sphericity[i], *(particles.centroid[i] + first)
-        neighbours = particles.neighbours[i]
+        touched = particles.neighbours[i]
         shown = [f"{each:.6g}" for each in sizes]
-        rows.append(
-            [particles.label[i], *shown, int(particles.cut[i]), len(neighbours), " ".join(map(str, neighbours))]
-        )
+        rows.append([particles.label[i], *shown, int(particles.cut[i]), len(touched), " ".join(map(str, touched))])
     return csv_text(rows)
 
 
 def facts_of(found: Found, settings: Mapping[str, Any]) -> dict[str, Any]:
     """All of a structure that is no array, for JSON; numbers that are not determined are null."""
-    numbers = {
-        name: {
-            **asdict(each),
-            "value": None if each.why_not else each.value,
-            "unit": unit_of(name),
-            "decides": each.decides,
-        }
-        for name, each in found.intervals.items()
-    }
     particles = found.structure.particles
     return {
         **settings, "levels": found.materials.levels.tolist(), "spread": found.materials.spread.tolist(),
         "thresholds_off": found.off, "undecided": found.undecided, "parts": len(found.parts),
-        "particles": int(particles.label.size), "cut": int(particles.cut.sum()), "numbers": numbers,
+        "particles": int(particles.label.size), "cut": int(particles.cut.sum()), "numbers": {
+            name: {**asdict(each), "value": None if each.why_not else each.value, "unit": unit_of(name),
+                   "decides": each.decides}
+            for name, each in found.intervals.items()
+        },
         "along_z": found.structure.along_z.tolist(), "radial": found.structure.radial[0].tolist(),
         "radii_um": found.structure.radial[1].tolist(),
     }  # fmt: skip
@@ -126,12 +119,11 @@ def page(
     settings: Mapping[str, Any],
 ) -> str:
     """The report page."""
-    rows = [
-        {"label": name, "cells": cells(name, each)[1:], "marked": False, "reason": ""} for name, each in table.items()
-    ]
     return render(
         "trials.html", title=title, summary=summary, sentences=sentences, pictures=pictures, bold=False,
-        heading="Numbers", columns=COLUMNS[1:], rows=rows, scan={name: str(each) for name, each in settings.items()},
+        heading="Numbers", columns=COLUMNS[1:],
+        rows=[{"label": name, "cells": cells(name, each)[1:], "marked": False} for name, each in table.items()],
+        scan={name: str(each) for name, each in settings.items()},
         command=str(settings.get("command", "")),
     )  # fmt: skip
 
@@ -143,5 +135,5 @@ def write_all(
     folder.mkdir()
     for name, text in texts.items():
         write_whole(folder / name, text)
-    for write in [partial(write_labels, folder / name, each, record, grid) for name, each in labels.items()]:
-        write()
+    for name, voxels in labels.items():
+        write_labels(folder / name, voxels, record, grid)

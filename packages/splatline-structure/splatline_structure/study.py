@@ -1,7 +1,8 @@
-"""`beamline structure-study`: intervals of numbers against the number of views of a scan."""
+"""`beamline study structure`: intervals of numbers against the number of views of a scan."""
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +13,27 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
 from beamline.core.files import atomic_file, refuse_existing, write_whole
 from beamline.core.text import csv_text, safe_name
-from splatline_structure.command import measured
-
-_FEWEST = 16  # views: 8 of each half
+from splatline_structure.command import FEWEST, measured
 
 
 def numbers_of_views(text: str) -> list[int]:
     """Parse whole numbers separated by commas. Raises ValueError for other text, or too few views to be parted."""
     counts = [int(part) for part in text.split(",")]
-    if min(counts) < _FEWEST:
-        raise ValueError(f"{text!r}: expected {_FEWEST} views or more, as both halves are reconstructed")
+    if min(counts) < FEWEST:
+        raise ValueError(f"{text!r}: expected {FEWEST} views or more, as both halves are reconstructed")
     return counts
 
 
-@click.command("structure-study")
+@click.command("study structure")
 @click.argument("scan", metavar="SCAN|RUN", type=click.Path(path_type=Path), callback=as_scan)
 @click.option("--views", metavar="N,N,...", required=True, callback=parsed(numbers_of_views), help="Numbers of views.")
 @click.option("--number", "names", multiple=True, default=("fraction_2", "size_50", "surface", "tortuosity_z"),
-              show_default=True, help="Number to follow; may be repeated.")  # fmt: skip
+              show_default=True, help="Number to follow, or all of a kind (tortuosity); may be repeated.")  # fmt: skip
 @click.option("-m", "--method", default="fista-tv", show_default=True, help="Of the reconstructions.")
 @click.option("--materials", type=click.IntRange(2, 6), default=2, show_default=True, help="Number of materials.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="New folder. Default: SCAN's stem + _views.")
 @json_option
-def structure_study(
+def study_structure(
     scan: Path,
     views: list[int],
     names: tuple[str, ...],
@@ -54,24 +53,22 @@ def structure_study(
     from splatline_structure import pictures, results
     from splatline_structure.numbers import Rules, structure_of
     from splatline_structure.particles import NECK
-    from splatline_structure.volumes import box_in
+    from splatline_structure.volumes import Part, box_in
 
     output = output or Path(f"{safe_name(scan.name.split('.')[0])}_views")
     values: dict[str, Any] = {
-        "materials": materials,
-        "particles": None,
-        "slices": None,
-        "parts": None,
-        "scan": scan,
-        "quick": False,
-    }
-    values |= {"crop": "square", "radius": 1, "smallest": 27, "neck": NECK, "side": 96, "through": 1}
+        "materials": materials, "particles": None, "parts": None, "scan": scan, "quick": False,
+        "radius": 1, "smallest": 27, "neck": NECK, "side": 96, "through": 1,
+    }  # fmt: skip
     with answering(as_json) as answer:
         refuse_existing(output)
-        thresholds = np.arange(1.0, materials)  # of nothing, for the names of numbers
-        known = structure_of(np.zeros((2, 2, 2), np.float32), thresholds, (1, 1, 1), Rules(materials, 1)).numbers
-        if unknown := set(names) - set(known):
-            raise click.UsageError(f"--number {min(unknown)}: expected one of {', '.join(known)}.")
+        known = structure_of(  # of nothing, for the names of numbers
+            np.zeros((2, 2, 2), np.float32), np.arange(1.0, materials), (1, 1, 1), Rules(materials, 1)
+        ).numbers
+        asked = {name: [each for each in known if f"{each}_".startswith(f"{name}_")] for name in names}
+        if unknown := [name for name, each in asked.items() if not each]:
+            raise click.UsageError(f"--number {unknown[0]}: expected one of {', '.join(known)}.")
+        names = tuple(dict.fromkeys(chain(*asked.values())))
         tell, series, axis_col, box = answer.counting("numbers of views"), {}, None, None
         for done, n in enumerate(sorted(views, reverse=True)):  # axis and box are those of the most views
             tell(done, len(views))
@@ -80,8 +77,9 @@ def structure_study(
                 raise DataError(f"{scan} does not state the size of a pixel. Nothing was written.")
             axis_col = record.axis_col
             try:
-                box = box or box_in(record.volume.data, True)
-                series[n] = measured(scan, record, box, answer, **values).found.intervals
+                box, n_slices = box or box_in(record.volume.data, True), record.grid.shape[0]
+                part = Part(record, slice(0, n_slices), slice(0, n_slices), n_slices)
+                series[n] = measured(scan, part, box, answer, **values).found.intervals
             except ValueError as error:
                 raise DataError(f"{n} views of {scan} cannot be measured: {error}. Nothing was written.") from error
         rows = [[str(n), *results.cells(name, series[n][name])] for n in views for name in names]

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from bench_coverage import RULES, box_of
 from grain_scenes import Scene
 
+import recon
 from beamline import api
 from splatline_structure import pictures, volumes
-from splatline_structure.volumes import box_in
+from splatline_structure.intervals import found_in
+from splatline_structure.volumes import box_in, parts_of, read_volume
 from tests.beamline.cli.small_scan import beamline, left
 
 SCENE = Scene(5, views=64, size=14, columns=48, rows=16, photons=1e5)
@@ -49,6 +53,23 @@ def test_halves_of_the_volumes_own_scan_are_made(here: Path) -> None:
 
 
 @pytest.mark.slow
+def test_halves_of_some_slices_are_those_of_their_rows(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By FBP, which takes each row for itself, they have the bits of whole halves; only rows near them are read."""
+    assert beamline("recon", "scan.h5", "-m", "fbp", "--no-report", "-o", "v.h5").exit_code == 0
+    monkeypatch.setattr(volumes, "_BESIDE", 2)
+    shapes, reconstruct = [], recon.reconstruct
+    monkeypatch.setattr(
+        volumes.recon, "reconstruct", lambda data, *of, **by: shapes.append(data.shape) or reconstruct(data, *of, **by)
+    )
+    whole, middle = (read_volume(Path("v.h5"), None, None, part, 10**9, True) for part in (None, (3, 12)))
+    scan = Path("scan.h5")
+    all_, some = (parts_of(part, scan, 2, pytest.fail, lambda *_: None) for part in (whole, middle))
+    assert [shape[1] for shape in shapes] == [16, 16, 13, 13]
+    for one, other in zip(all_, some, strict=True):
+        np.testing.assert_array_equal(one[3:12], other)
+
+
+@pytest.mark.slow
 def test_halves_of_a_scan_without_pixel_size_are_in_the_volumes_unit(here: Path) -> None:
     """They were 1/mm beside a volume in 1/px, and thresholds lay off by 27 gaps of levels."""
     with h5py.File("scan.h5", "r+") as file:
@@ -56,6 +77,18 @@ def test_halves_of_a_scan_without_pixel_size_are_in_the_volumes_unit(here: Path)
     assert beamline("recon", "scan.h5", "-m", "fbp", "--no-report", "-o", "v.h5").exit_code == 0
     result = beamline("structure", "v.h5", "--voxel-um", "2", "--side", "0", "--json")
     assert json.loads(result.stdout.splitlines()[-1])["thresholds_off"] < 0.1
+
+
+@pytest.mark.slow
+def test_thirty_views_of_a_thousand_photons_across_256_columns_determine_nothing() -> None:
+    scene = Scene(1, columns=256, rows=8, views=30, photons=1e3)
+    data, views, box = scene.views_of(scene.phantom()), np.arange(scene.views), box_of(scene)
+    of_views = [
+        recon.reconstruct(data[part], scene.geometry.select(part), scene.method, grid=scene.grid).volume.data[box]
+        for part in (views, views[::2], views[1::2])
+    ]
+    intervals = found_in(of_views[0], of_views[1:], 2, (1, 1, 1), replace(RULES, side=0)).intervals
+    assert all("more views or photons" in each.why_not for each in intervals.values())
 
 
 @pytest.mark.slow
@@ -67,15 +100,15 @@ def test_intervals_against_views_are_wider_for_fewer_in_one_box_about_one_axis(
     monkeypatch.setattr(
         api, "reconstruct", lambda *at, **of: axes.append(of["selection"].axis_col) or reconstruct(*at, **of)
     )
-    words = ("-m", "fbp", "--number", "fraction_2", "--number", "surface")
-    result = beamline("structure-study", "scan.h5", "--views", "16,64", *words)
+    words = ("-m", "fbp", "--number", "fraction", "--number", "surface")
+    result = beamline("study", "structure", "scan.h5", "--views", "16,64", *words)
     assert result.exit_code == 0, result.output
     with (here / "scan_views/numbers.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["n_views"], row["number"]) for row in rows] == [
-        (views, name) for views in ("16", "64") for name in ("fraction_2", "surface")
+        (views, name) for views in ("16", "64") for name in ("fraction_1", "fraction_2", "surface")
     ]
-    few, all_ = rows[1], rows[3]
+    few, all_ = rows[2], rows[5]
     assert few["value"] == "not determined" or float(few["views"]) > float(all_["views"])
     assert (here / "scan_views/report.html").is_file()
     assert len(boxes) == 1 and axes[0] is None and axes[1] == pytest.approx(23.5, abs=0.2)
@@ -85,7 +118,7 @@ def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(api, "reconstruct", None)
-    result = beamline("structure-study", "scan.h5", "--views", "16,64", "--number", "fraction_3")
+    result = beamline("study", "structure", "scan.h5", "--views", "16,64", "--number", "fraction_3")
     assert (
         result.exit_code == 2 and "--number fraction_3: expected one of fraction_1, fraction_2, surf" in result.stderr
     )
@@ -94,6 +127,6 @@ def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
 
 @pytest.mark.parametrize(("views", "words"), [("8,64", "16 views or more"), ("many", "invalid literal")])
 def test_views_that_cannot_be_parted_are_refused(here: Path, views: str, words: str) -> None:
-    result = beamline("structure-study", "scan.h5", "--views", views)
+    result = beamline("study", "structure", "scan.h5", "--views", views)
     assert result.exit_code == 2 and words in result.stderr
     assert left(here) == {"scan.h5"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatline_structure.intervals import SPLIT_OR_MERGED, _of_particles
+from splatline_structure.intervals import SPLIT_OR_MERGED, Interval, _of_particles
 from splatline_structure.particles import Particles
 
 
@@ -29,3 +29,8 @@ def test_a_size_is_as_sure_as_a_share_of_so_many_particles(percent: int) -> None
 
 def test_other_numbers_and_a_field_without_whole_particles_have_none_of_it() -> None:
     assert _of_particles("surface", grains(5)) == _of_particles("size_50", grains(5, cut=True)) == 0
+
+
+def test_words_name_no_cause_where_none_moves_a_number() -> None:
+    assert Interval(1, 0.999, 1, 0, views=0, levels=0, voxels=0, particles=0).words == "nothing moves this"
+    assert Interval(1, 0.99, 1, 0, views=0, levels=0.01, voxels=0).words == "the threshold decides this, not the views"

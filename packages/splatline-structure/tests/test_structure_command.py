@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import tifffile
-from can_of_balls import BALLS, can
+from can_of_balls import BALLS, MATRIX, can
 from scipy import ndimage
 
 from splatline_structure import command, pictures
@@ -129,6 +131,63 @@ def test_few_photons_determine_nothing(here: Path) -> None:
     assert "not determined" in result.stdout and "could be of either material" in result.stdout
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_of_a_volume_larger_than_the_memory_the_middle_is_looked_at_and_all_for_fractions(here: Path) -> None:
+    volume = can()
+    volume[30:] = np.minimum(volume[30:], MATRIX + 0.1)  # the upper slices hold less than the middle
+    np.save(here / "can.npy", volume)
+    np.save(here / "half.npy", volume[::-1])
+    common = ("structure", "can.npy", *VOXEL_UM, "--side", "0", "--parts", "half.npy", "half.npy")
+    result = beamline(*common, "--memory", "13.3M", "-o", "part")
+    assert result.exit_code == 0, result.output
+    words = "13.3 MB of memory hold 17 of 40 slices: numbers are of slices 11:28, in the middle"
+    assert words in result.stderr and words in result.stdout
+    assert words in (here / "part/report.html").read_text(encoding="utf-8")
+    rows = {row["number"]: row for row in _rows(here / "part/numbers.csv")}
+    assert {row["box"].split(",")[0] for name, row in rows.items() if name.endswith("_all")} == {"0:40"}
+    assert {row["box"].split(",")[0] for name, row in rows.items() if not name.endswith("_all")} == {"11:28"}
+    facts = json.loads((here / "part/structure.json").read_text(encoding="utf-8"))
+    y, x = (slice(*map(int, part.split(":"))) for part in facts["box"].split(",")[1:])
+    dense = volume[:, y, x] > np.mean(facts["levels"])
+    numbers = facts["numbers"]
+    assert numbers["fraction_2"]["value"] == pytest.approx(dense[11:28].mean())
+    assert numbers["fraction_2_all"]["value"] == pytest.approx(dense.mean())
+    for name in ("fraction_1", "fraction_2", "surface"):
+        one, each = numbers[f"{name}_all"], numbers[name]
+        assert one["high"] - one["low"] == pytest.approx(each["high"] - each["low"])
+    with h5py.File(here / "part/particles.h5") as file:
+        assert file["entry/data/labels"].shape[0] == 17
+        assert file["entry/data/z"][0] == pytest.approx(0.01 * (11 - 39 / 2))
+
+
+@pytest.mark.slow
+def test_memory_stays_within_what_was_given(tmp_path: Path) -> None:
+    """In a process of its own, beyond what it takes with a small volume."""
+    lines = """
+import sys
+import numpy as np
+from scipy import ndimage
+from click.testing import CliRunner
+from beamline.cli.main import main
+from beamline.core.machine import peak_memory
+rng, peaks = np.random.default_rng(0), []
+for n, memory in ((16, "1G"), (120, "60M")):
+    small = ndimage.gaussian_filter(rng.normal(size=(n, 64, 64)), 3)
+    np.save("v.npy", (small > 0).astype(np.float32) + rng.normal(0, 0.05, small.shape).astype(np.float32))
+    np.save("h.npy", np.load("v.npy"))
+    del small
+    words = "structure", "v.npy", "--voxel-um", "1", "--crop", "none", "--side", "0", "--memory", memory, "-o", f"o{n}"
+    result = CliRunner().invoke(main, [*words, "--parts", "h.npy", "h.npy"])
+    assert result.exit_code == 0, result.output
+    peaks.append(peak_memory())
+assert "60 MB of memory hold 89 of 120 slices" in result.output
+print(peaks[1] - peaks[0])
+"""
+    ran = subprocess.run([sys.executable, "-c", lines], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert 0 < int(ran.stdout) < 60e6
+
+
 REFUSED = [
     (("even.npy", *VOXEL_UM), 5, "even.npy cannot be measured"),
     (("noise.npy", *VOXEL_UM), 5, "no contrast: materials 1 and 2 of 2"),
@@ -136,6 +195,8 @@ REFUSED = [
     (("holes.npy", *VOXEL_UM), 5, "values that are not finite"),
     (("small.npy", *VOXEL_UM), 5, "expected 8 or more voxels a side"),
     (("can.npy", *VOXEL_UM, "--slices", "3", "99"), 5, "has slices 0 to 40"),
+    (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "8 slices of 72 x 72 voxels take 9.75 MB, and 4 MB may be used"),
+    (("can.npy", *VOXEL_UM, "--memory", "some"), 2, "'some' is not a size"),
     (("can.npy", *VOXEL_UM, "--particles", "3"), 2, "Material 3 of 2"),
     (("can.npy", *VOXEL_UM, "--compare"), 2, "--compare takes two volumes"),
     (("can.npy", "can.npy", *VOXEL_UM, "--parts", "can.npy", "can.npy"), 2, "--parts are of one volume"),
