@@ -32,7 +32,7 @@ depth of a tooth's thin cracks. Simulated cathodes that gain 4 to 11 dB have 14 
 afterwards 13.5 and 13.9 %."""
 _FIRST, _LONGEST = 1.0, 64.0  # squares of lengths, in pixels: where the search begins, and the largest
 _ERRORS = 3.0  # standard errors by which a filter must predict better than none
-_CLOSE = 0.9  # of `LEAST_DROP`, by whole octaves: half octaves lowered the residual of 36 scans by up to a sixteenth more
+_CLOSE = 0.9  # of `LEAST_DROP`, by whole octaves: half octaves gained up to a sixteenth more, of 36 scans
 _VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a trial by `FistaTv`
 
 
