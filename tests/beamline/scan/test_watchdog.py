@@ -31,7 +31,7 @@ from tests.simulators.wires.transports import serve_tcp
 
 pytestmark = pytest.mark.usefixtures("simulated_zaber")
 FREEZES = (("zaber", "scan"),) if os.name == "posix" else ()
-OTHERS = (("pi_gcs", ""), ("pm16c", ""), *FREEZES)
+OTHERS = (pytest.param("pi_gcs", "", marks=pytest.mark.long), ("pm16c", ""), *FREEZES)
 STAGES = {"pi_gcs": "axis: A, trigger_line: 1", "zaber": "output: 1", "pm16c": "channel: 3"}
 SCAN = """
 import sys, time
