@@ -48,8 +48,6 @@ REAL = {
 }
 MADE = ("21", "31", "32", "34", "44", "45", "54", "57", "77", "78", "83", "91", "101", "102", "103", "107", "108",
         "111", "116", "121", "123", "132", "136", "138", "140", "152")  # fmt: skip
-QUICK_EACH = 80  # of the small scans
-GATE_EACH = 10  # of the cases without a sentence that no case before them has
 LONG = {15, 39, 45, 52, 55}  # clean scans of 720 views, beside two others of as many
 
 
@@ -135,6 +133,7 @@ def cases() -> Mapping[str, Callable[[], list[Row]]]:
 
 
 CASES = cases()
+QUICK = [*SCANS][::80]
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
@@ -179,21 +178,23 @@ def new_files(rows: Iterable[Row], sentences: set[tuple[str, ...]]) -> list[str]
 
 
 def marked() -> list[Any]:
-    """Quick ones; for the gate those that have a sentence which no case before them has, of shared cases the files
-    that have one, and some others; the rest."""
-    marks, sentences = list[Any](), set[tuple[str, ...]]()
+    """Quick ones; for the gate those that have a sentence which no case with more of them has, and of shared cases the
+    files that have one; the rest."""
+    said = {name: sentences_of(recorded().get(name, [])) for name in CASES if not name.startswith("shared: ")}
+    sentences, in_gate = set[tuple[str, ...]](), set[str]()
+    for name in sorted(said, key=lambda name: -len(said[name])):
+        if not said[name] <= sentences:
+            in_gate.add(name)
+        sentences |= said[name]
     slow, long = pytest.mark.slow, (pytest.mark.slow, pytest.mark.long)
-    for n, name in enumerate(CASES):
-        rows = recorded().get(name, [])
-        if name.startswith("shared: "):
-            if files := new_files(rows, sentences):
-                marks.append(pytest.param(name, files, marks=slow, id=name))
-            marks.append(pytest.param(name, (), marks=long, id=f"{name}, all files"))
-            continue
-        in_gate = n % GATE_EACH == 0 or not sentences_of(rows) <= sentences
-        quick = name in SCANS and n % QUICK_EACH == 0
-        marks.append(pytest.param(name, (), marks=() if quick else slow if in_gate else long, id=name))
-        sentences |= sentences_of(rows)
+    marks = [
+        pytest.param(name, (), marks=() if name in QUICK else slow if name in in_gate else long, id=name)
+        for name in said
+    ]
+    for name in [name for name in CASES if name not in said]:
+        if files := new_files(recorded().get(name, []), sentences):
+            marks.append(pytest.param(name, files, marks=slow, id=name))
+        marks.append(pytest.param(name, (), marks=long, id=f"{name}, all files"))
     return marks
 
 
