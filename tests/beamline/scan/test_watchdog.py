@@ -62,7 +62,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="a process of Windows gets
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "frozen"), [("zaber", ""), *OTHERS])
+@pytest.mark.parametrize(("kind", "frozen"), [pytest.param("zaber", "", marks=pytest.mark.long), *OTHERS])
 def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
     tmp_path: Path, kind: str, frozen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
