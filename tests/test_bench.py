@@ -267,6 +267,7 @@ def test_gpu_curve() -> None:
     assert [method.name for method in made] == ["r2-published", "r2", "auto", "fista-tv"]
 
 
+@pytest.mark.long  # two scans in real time
 def test_open_pages(monkeypatch: Patch, tmp_path: Path) -> None:
     bench = script("test_open_pages")
     small(monkeypatch, bench, PAIRS=1, PAGES=1, VIEWS=24, SPAN=60)

@@ -1,12 +1,14 @@
 """Features are folders and modules that can be removed: the core runs without each of them, and without all."""
 
+import itertools
 import json
+import math
 import os
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -36,13 +38,13 @@ import json, os, sys, traceback
 
 import click, h5py, numpy, pydantic, rich.console, yaml  # once, not by each fork
 
-features, loads = json.loads(sys.argv[1]), sys.argv[2]
+parts, loads = json.loads(sys.argv[1]), sys.argv[2]
 del sys.argv[1:3]
-for feature, paths in features.items():
+for part, paths in parts.items():
     for n, path in enumerate(paths):
         os.rename(path, f"aside/{n}")
     if not (child := os.fork()):
-        page = os.open(f"aside/{feature}.txt", os.O_CREAT | os.O_WRONLY)
+        page = os.open(f"aside/{part}.txt", os.O_CREAT | os.O_WRONLY)
         os.dup2(page, 1), os.dup2(page, 2)
         try:
             exec(loads)
@@ -56,7 +58,7 @@ for feature, paths in features.items():
     for n, path in enumerate(paths):
         os.rename(f"aside/{n}", path)
 """
-"""Runs its second argument in a fork for each feature, without that; each writes to a file."""
+"""Runs its second argument in a fork for each part of the features, without that; each writes to a file."""
 _METHODS = "import recon\nfor entry in recon.methods.REGISTRY.values(): getattr(recon, entry.cls)()"
 _QUICK = (
     "tests/beamline/plan", "tests/beamline/simulate", "tests/recon/assess", "tests/recon/base/test_geometry.py",
@@ -133,17 +135,31 @@ def _environment(root: Path) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(root)}
 
 
+def parts_that_tell_apart(names: Sequence[str]) -> list[list[str]]:
+    """Parts of the names such that of any two names each is in one without the other: the codes of equally many ones
+    (Sperner, 1928), of which none is within another."""
+    digits = next(n for n in itertools.count(1) if math.comb(n, n // 2) >= len(names))
+    codes = itertools.combinations(range(digits), digits // 2)
+    of_each = dict(zip(names, codes, strict=False))
+    return [[name for name, code in of_each.items() if digit in code] for digit in range(digits)]
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="each feature has a fork of one process")
-def test_the_core_loads_without_any_one_feature(copied: Path) -> None:
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="each part has a fork of one process")
+def test_the_core_loads_without_any_one_feature_and_none_needs_another(copied: Path) -> None:
+    """Without parts of them: that any feature loads without any other one is seen in one of these."""
     (copied / "aside").mkdir(exist_ok=True)
+    parts = parts_that_tell_apart([name for name in table() if name != "shared"])
+    for one, other in itertools.permutations(set(table()) - {"shared"}, 2):
+        assert any(one in part and other not in part for part in parts)
     named = {
-        name: [str(path.relative_to(copied)) for path in folders(name, copied)] for name in table() if name != "shared"
+        str(n): [str(path.relative_to(copied)) for name in part for path in folders(name, copied)]
+        for n, part in enumerate(parts)
     }
     _run(copied, "-c", _FORKS, json.dumps(named), _LOADS, *CORE)
-    for name in named:
-        help_page = (copied / "aside" / f"{name}.txt").read_text(encoding="utf-8")
-        assert all(f"\n  {command} " in help_page for command in CORE), f"without {name}:\n{help_page[-3000:]}"
+    for n, part in enumerate(parts):
+        help_page = (copied / "aside" / f"{n}.txt").read_text(encoding="utf-8")
+        assert all(f"\n  {command} " in help_page for command in CORE), f"without {part}:\n{help_page[-3000:]}"
 
 
 @pytest.mark.slow

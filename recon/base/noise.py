@@ -7,8 +7,8 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from recon.base.arrays import F32, median_deviation, some_values
 from recon.base.geometry import Geometry
@@ -142,7 +142,7 @@ def air_level(values: F32) -> tuple[float, float]:
     if not high > low:
         return float(low), 0.0
     counts, edges = np.histogram(values, _BINS, (low, high))
-    smooth = np.concatenate(([0], gaussian_filter(counts.astype(np.float64), 2), [0]))
+    smooth = np.concatenate(([0], scipy.ndimage.gaussian_filter(counts.astype(np.float64), 2), [0]))
     least = _PEAK * smooth.max()
     first_peak = _first_peak(smooth, least, least / 2)
     level = float(edges[first_peak - 1] + edges[first_peak]) / 2

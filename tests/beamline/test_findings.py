@@ -13,7 +13,7 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,8 +48,6 @@ REAL = {
 }
 MADE = ("21", "31", "32", "34", "44", "45", "54", "57", "77", "78", "83", "91", "101", "102", "103", "107", "108",
         "111", "116", "121", "123", "132", "136", "138", "140", "152")  # fmt: skip
-QUICK_EACH = 40  # of the small scans
-GATE_EACH = 10  # of the cases in which nothing is said that no case before them has
 LONG = {15, 39, 45, 52, 55}  # clean scans of 720 views, beside two others of as many
 
 
@@ -106,8 +104,8 @@ def of_clean_scan(seed: int) -> list[Row]:
     return of_source(cast(ScanSource, source), source.axis_col)
 
 
-def of_shared_case(name: str) -> list[Row]:
-    """What is found in the files that the case makes."""
+def of_shared_case(name: str, files: Collection[str] = ()) -> list[Row]:
+    """What is found in the files that the case makes, or in these of them."""
     with TemporaryDirectory() as folder:
         made = Path(folder).resolve() / name
         shutil.copytree(SHARED_CASES / name, made)
@@ -116,7 +114,7 @@ def of_shared_case(name: str) -> list[Row]:
         before = set(made.iterdir())
         subprocess.run([sys.executable, "make.py"], cwd=made, check=True, capture_output=True)
         rows: list[Row] = []
-        for path in sorted(set(made.iterdir()) - before):
+        for path in sorted(path for path in set(made.iterdir()) - before if not files or path.name in files):
             rows += [[f"{path.name}: {who}", *row] for who, *row in of_file(path)]
         return rows
 
@@ -135,6 +133,7 @@ def cases() -> Mapping[str, Callable[[], list[Row]]]:
 
 
 CASES = cases()
+QUICK = [*SCANS][::80]
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
@@ -155,25 +154,59 @@ def recorded() -> dict[str, list[Row]]:
     return cast(dict[str, list[Row]], json.loads(RECORD.read_text(encoding="utf-8")))
 
 
+def sentences_of(rows: Iterable[Row], file: str = "") -> set[tuple[str, ...]]:
+    """Each sentence with who finds it, its rule and severity; without numbers and the file's name."""
+    return {
+        (*who, _NUMBER.sub("#", sentence.replace(file, "FILE") if file else sentence))
+        for *who, _, text in rows
+        for sentence in re.split(r"(?<=\.) (?=[A-Z])", text)
+    }
+
+
+def new_files(rows: Iterable[Row], sentences: set[tuple[str, ...]]) -> list[str]:
+    """Of a shared case the files with a sentence that is none of these, to which theirs are added."""
+    files = dict[str, list[Row]]()
+    for who, *row in rows:
+        file, _, finder = who.partition(": ")
+        files.setdefault(file, []).append([finder, *row])
+    new = []
+    for file, ours in files.items():
+        if not (said := sentences_of(ours, file)) <= sentences:
+            new.append(file)
+            sentences |= said
+    return new
+
+
 def marked() -> list[Any]:
-    """Quick ones; those that have a sentence which no case before them has, and some others, for the gate; the rest."""
-    marks, sentences = list[Any](), set[tuple[str, ...]]()
-    for n, name in enumerate(CASES):
-        ours = {(*who, _NUMBER.sub("#", sentence)) for *who, _, sentence in recorded().get(name, [])}
-        in_gate = n % GATE_EACH == 0 or not ours <= sentences
-        slow = [] if name in SCANS and n % QUICK_EACH == 0 else [pytest.mark.slow]
-        marks.append(pytest.param(name, marks=slow if in_gate else [*slow, pytest.mark.long]))
-        sentences |= ours
+    """Quick ones; for the gate those that have a sentence which no case with more of them has, and of shared cases the
+    files that have one; the rest."""
+    said = {name: sentences_of(recorded().get(name, [])) for name in CASES if not name.startswith("shared: ")}
+    sentences, in_gate = set[tuple[str, ...]](), set[str]()
+    for name in sorted(said, key=lambda name: -len(said[name])):
+        if not said[name] <= sentences:
+            in_gate.add(name)
+        sentences |= said[name]
+    slow, long = pytest.mark.slow, (pytest.mark.slow, pytest.mark.long)
+    marks = [
+        pytest.param(name, (), marks=() if name in QUICK else slow if name in in_gate else long, id=name)
+        for name in said
+    ]
+    for name in [name for name in CASES if name not in said]:
+        if files := new_files(recorded().get(name, []), sentences):
+            marks.append(pytest.param(name, files, marks=slow, id=name))
+        marks.append(pytest.param(name, (), marks=long, id=f"{name}, all files"))
     return marks
 
 
-@pytest.mark.parametrize("case", marked())
-def test_findings_are_those_that_were_recorded(case: str) -> None:
+@pytest.mark.parametrize(("case", "files"), marked())
+def test_findings_are_those_that_were_recorded(case: str, files: Collection[str]) -> None:
+    """In all files of a shared case, or in these of them."""
     if case.startswith("real: ") and not (SHARED_DATA / REAL[case[6:]]).is_file():
         pytest.skip(f"{REAL[case[6:]]} is not beside this checkout (../shared/data)")
     if case.startswith("shared: ") and not (SHARED_CASES / case[8:]).is_dir():
         pytest.skip(f"case {case[8:]} is not in a folder beside the real scans")
-    now, then = CASES[case](), recorded()[case]
+    now = of_shared_case(case[8:], files) if files else CASES[case]()
+    then = [row for row in recorded()[case] if not files or row[0].partition(": ")[0] in files]
     assert alike(now, then), "\n".join(
         [*(f"- {row}" for row in then if row not in now), *(f"+ {row}" for row in now if row not in then)]
     )

@@ -141,7 +141,11 @@ def test_a_checkpoint_of_more_views_is_refused(noisy: np.ndarray) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
-    [FitSettings(loss="poisson"), FitSettings(joined_pixels=2), FitSettings(views_per_step=3)],
+    [
+        FitSettings(loss="poisson"),
+        FitSettings(joined_pixels=2),
+        pytest.param(FitSettings(views_per_step=3), marks=pytest.mark.long),
+    ],
 )
 def test_every_way_to_fit_beats_fbp(phantom: Phantom, noisy: np.ndarray, settings: FitSettings) -> None:
     truth = phantom.attenuation(GRID)

@@ -63,6 +63,7 @@ views = recon.Geometry.cone(np.linspace(0, 2.8, 12), shape, 0.2, 20.0, 40.0, rol
 _OF_THE_FIT = "method, views, weighted=weighted"
 _OF_A_PARALLEL_BEAM = "recon.R2(fit=FitSettings(loss=loss))"
 _EXACT = "cone, a short scan, rolled, exact rays"
+_LEANING = "parallel, some views lean, all are shifted, weights"
 
 
 def _late(kind: str, warm: str) -> list[str]:
@@ -75,7 +76,7 @@ def _late(kind: str, warm: str) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["parallel, some views lean, all are shifted, weights", _EXACT])
+@pytest.mark.parametrize("kind", [_LEANING, pytest.param(_EXACT, marks=pytest.mark.long)])
 def test_a_fit_after_warm_up_compiles_nothing(kind: str) -> None:
     assert _late(kind, _OF_THE_FIT) == []
 

@@ -30,7 +30,7 @@ def test_what_is_printed_to_a_full_disk_is_an_error_of_the_disk(folder: Path) ->
 
 @POSIX
 @pytest.mark.slow
-@pytest.mark.parametrize("redirected", ["> /dev/full 2>&1", ">&- 2>&- <&-"])
+@pytest.mark.parametrize("redirected", [pytest.param("> /dev/full 2>&1", marks=pytest.mark.long), ">&- 2>&- <&-"])
 def test_a_command_that_leaves_a_file_ends_as_ever(tmp_path: Path, redirected: str) -> None:
     write_exchange(tmp_path / "scan.h5", SCAN)
     assert _run(tmp_path, redirected, "ingest", "scan.h5", "out.h5").returncode == 0

@@ -137,7 +137,7 @@ def assert_equal(again: FrameFlags, written: FrameFlags | None) -> None:
         np.testing.assert_array_equal(getattr(again, name), getattr(written, name))
 
 
-@pytest.mark.parametrize("examples", others_slow([1, 12]))
+@pytest.mark.parametrize("examples", others_slow([1, 6]))
 def test_a_run_and_its_file_have_the_same_flags(examples: int) -> None:
     settings(max_examples=examples, deadline=None)(_same_flags)()
 

@@ -21,6 +21,8 @@ from tests.beamline.cli.small_scan import beamline, left
 from tests.beamline.reconstruct.growing_scan import ScanClock
 from tests.beamline.scans import TwoCylinders, write_exchange
 
+LONG = (pytest.mark.slow, pytest.mark.long)
+
 
 @pytest.fixture
 def tall(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator) -> TwoCylinders:
@@ -48,7 +50,7 @@ def volume(*options: str) -> np.ndarray:
     [
         ("2M", ["--bin", "2"]),
         pytest.param("3M", ["--rows", "33:181"], marks=pytest.mark.slow),
-        pytest.param("3M", ["--air", "none"], marks=pytest.mark.slow),
+        pytest.param("3M", ["--air", "none"], marks=LONG),
     ],
 )
 def test_the_volume_is_the_same_to_the_bit_in_as_many_slabs_as_its_dry_run_says(
@@ -95,8 +97,8 @@ def test_weights_of_pixels_that_measured_nothing_are_in_the_plan(tmp_path: Path)
     ("method", "memory", "views", "shape"),
     [
         (("fbp",), 40, 60, (400, 256)),
-        (("os-sirt-tv", "--iterations", "2"), 44, 30, (320, 96)),
-        pytest.param(("cgls", "--iterations", "2"), 56, 30, (200, 256), marks=pytest.mark.long),
+        pytest.param(("os-sirt-tv", "--iterations", "2"), 44, 30, (320, 96), marks=LONG),
+        pytest.param(("cgls", "--iterations", "2"), 56, 30, (200, 256), marks=LONG),
     ],
 )
 def test_no_more_memory_is_taken_than_was_given(
@@ -128,7 +130,7 @@ def test_no_more_memory_is_taken_than_was_given(
 @pytest.mark.parametrize(
     ("method", "more", "memory", "near"),
     [
-        ("sirt", ["--iterations", "2"], "20M", 1e-6),
+        pytest.param("sirt", ["--iterations", "2"], "20M", 1e-6, marks=LONG),
         ("fista-tv", ["--iterations", "3", "--tv-weight", "0.002"], "24M", 2e-3),
     ],
 )

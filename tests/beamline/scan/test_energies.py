@@ -94,7 +94,7 @@ def test_each_energy_has_a_scan(config: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("at", [22 + 2, 22 + 14])
+@pytest.mark.parametrize("at", [22 + 2, pytest.param(22 + 14, marks=pytest.mark.long)])
 def test_a_series_that_was_stopped_goes_on(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:

@@ -240,7 +240,7 @@ CHOICES = st.lists(st.sampled_from([Choice.NEXT, Choice.AGAIN, Choice.OFFSET, Ch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["fly", "step"])
+@pytest.mark.parametrize("mode", ["fly", pytest.param("step", marks=pytest.mark.long)])
 @settings(max_examples=3, deadline=None, phases=[Phase.generate])
 @given(script=CHOICES, cuts=st.lists(st.integers(FIRST, FIRST + VIEWS + WIDE - 1), min_size=1, max_size=2))
 def test_any_scan_that_is_killed_goes_on(mode: str, script: list[Choice], cuts: list[int]) -> None:

@@ -31,7 +31,7 @@ from tests.simulators.wires.transports import serve_tcp
 
 pytestmark = pytest.mark.usefixtures("simulated_zaber")
 FREEZES = (("zaber", "scan"),) if os.name == "posix" else ()
-OTHERS = (("pi_gcs", ""), ("pm16c", ""), *FREEZES)
+OTHERS = (pytest.param("pi_gcs", "", marks=pytest.mark.long), ("pm16c", ""), *FREEZES)
 STAGES = {"pi_gcs": "axis: A, trigger_line: 1", "zaber": "output: 1", "pm16c": "channel: 3"}
 SCAN = """
 import sys, time
@@ -62,7 +62,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="a process of Windows gets
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "frozen"), [("zaber", ""), *OTHERS])
+@pytest.mark.parametrize(("kind", "frozen"), [pytest.param("zaber", "", marks=pytest.mark.long), *OTHERS])
 def test_a_killed_scan_is_made_safe_and_one_that_ends_is_left_alone(
     tmp_path: Path, kind: str, frozen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,7 +25,7 @@ SHIM = """
 #include <stdlib.h>
 int flock(int file, int operation) { errno = atoi(getenv("FLOCK_FAILS")); return -1; }
 """
-MISSING = [errno.ENOLCK, errno.EOPNOTSUPP]
+MISSING = [errno.ENOLCK, pytest.param(errno.EOPNOTSUPP, marks=pytest.mark.long)]
 
 
 @pytest.fixture(scope="module")

@@ -38,9 +38,12 @@ def _virtual(file: h5py.File, name: str) -> None:
 @PIPES
 @pytest.mark.parametrize("draw", [_external, _virtual])
 def test_a_scan_that_draws_on_a_pipe(tmp_path: Path, path: Path, draw: Callable[[h5py.File, str], None]) -> None:
-    os.mkfifo(tmp_path / "pipe")
+    """Also one that was harmless when it was opened before, or whose source was not there yet."""
+    open_scan(path).close()
     with h5py.File(path, "r+") as file:
         draw(file, "pipe")
+    open_scan(path).close()
+    os.mkfifo(tmp_path / "pipe")
     with pytest.raises(DataError, match=r"links to .*or a pipe"):
         open_scan(path)
 

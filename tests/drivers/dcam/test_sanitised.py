@@ -55,6 +55,7 @@ def _run(environment: dict[str, str], *arguments: str) -> subprocess.CompletedPr
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_suite_passes_under_sanitisers(environment: dict[str, str]) -> None:
     ran = _run(environment, "-m", "pytest", "-q", "-p", "no:cacheprovider", *(str(HERE / name) for name in SUITE))
     assert ran.returncode == 0, (ran.stdout + ran.stderr)[-4000:]

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests.recon.hard_cases.on import On, cpu, gpu
 
 # The interpreter is numpy, which warns of an infinity that a GPU just makes; tests/recon/kernels/gpu is quick.
 INTERPRETED = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarning")]
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of each law the first case is interpreted in the gate, the others before a release."""
+    known = set[tuple[Path, str]]()
+    for item in items:
+        if isinstance(item, pytest.Function) and "on" in item.fixturenames and "[gpu" in item.name:
+            if (law := (item.path, item.originalname)) in known:
+                item.add_marker(pytest.mark.long)
+            known.add(law)
 
 
 @pytest.fixture(params=[pytest.param(cpu, id="cpu"), pytest.param(gpu, id="gpu", marks=INTERPRETED)])

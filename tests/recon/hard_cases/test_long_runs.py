@@ -34,7 +34,10 @@ def _start_and_data() -> tuple[Gaussians, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("steps", "loss"),
-    [(1500, 9e-4), pytest.param(30_000, 6e-4, marks=[pytest.mark.slow, pytest.mark.timeout(600)])],
+    [
+        (1500, 9e-4),
+        pytest.param(30_000, 6e-4, marks=[pytest.mark.slow, pytest.mark.long, pytest.mark.timeout(600)]),
+    ],
 )
 def test_steps_without_drift(steps: int, loss: float) -> None:
     start, data = _start_and_data()

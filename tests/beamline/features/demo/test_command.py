@@ -48,6 +48,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("real_pictures")
 def test_from_trigger_to_judged_volume(here: Path) -> None:
     events: list[Event] = []

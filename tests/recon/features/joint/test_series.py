@@ -162,7 +162,7 @@ def blobs() -> F32:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moves", [True, False])
+@pytest.mark.parametrize("moves", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_views_held_out_tell_a_sample_that_moves_from_one_that_fades_where_angles_rise(moves: bool) -> None:
     """By five columns of forty in half a turn: views before and after one held out predict it, too."""
     times, geometry = np.linspace(0, 10, 48), Geometry.parallel(np.pi * np.arange(48) / 48, (ROWS, SIDE))

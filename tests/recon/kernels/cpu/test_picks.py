@@ -18,6 +18,7 @@ from recon.kernels.cpu import lanes
 from recon.kernels.cpu.picks import NEAR_STEP, bilinear, bilinear_near, lanes_per_window, least, pick, pick_near, whole
 
 F32 = NDArray[np.float32]
+GENERIC = {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}
 
 
 @njit
@@ -81,7 +82,8 @@ def test_lanes_that_nobody_wants_read_within_32_neighbours() -> None:
     ("level", "laws"),
     [
         (V3.environment, "pick or lanes or tiles or steps_of_any_length or single_slice_is"),
-        ({"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, "pick or lanes or single_slice_is"),
+        (GENERIC, "pick or lanes"),
+        pytest.param(GENERIC, "single_slice_is", marks=pytest.mark.long),
     ],
 )
 def test_picks_need_no_avx512(level: Mapping[str, str], laws: str) -> None:

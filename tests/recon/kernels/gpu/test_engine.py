@@ -40,11 +40,14 @@ def _fit(
     return state, [*records, fit.misfit_of(state, problem, settings)]
 
 
+LONG = (pytest.mark.slow, pytest.mark.long)
+
+
 @pytest.mark.parametrize(
     ("make", "kernel", "changes"),
     [
         (parallel, Kernel.GAUSSIAN, {"loss": "poisson", "views_per_step": 2}),
-        pytest.param(cone, Kernel.COMPACT, {"loss": "l1", "rays": RayModel(exact_above=0.05)}, marks=pytest.mark.slow),
+        pytest.param(cone, Kernel.COMPACT, {"loss": "l1", "rays": RayModel(exact_above=0.05)}, marks=LONG),
     ],
 )
 def test_a_fit_is_the_same_on_both_backends(

@@ -56,7 +56,7 @@ PATHS: dict[str, tuple[Geometry | Grid, RayModel | None, Kernel]] = {
 @pytest.mark.parametrize("path", PATHS)
 def test_images_volumes_and_their_gradients_equal_the_reference(path: str, random_gaussians: Make) -> None:
     where, model, kernel = PATHS[path]
-    found = compare(random_gaussians(12, 8.0, kernel=kernel), where, model=model, device=DEVICE)
+    found = compare(random_gaussians(8, 8.0, kernel=kernel), where, model=model, device=DEVICE)
     assert found.value < 5e-6 and found.worst < 2e-5, found.gradients
 
 
