@@ -193,7 +193,8 @@ class LazyGroup(click.Group):
         return list(commands())
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        return command.load(cmd_name) if (command := _command(cmd_name)) else None
+        command = _command(cmd_name)
+        return None if command is None else command.load(cmd_name)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

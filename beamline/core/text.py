@@ -40,11 +40,9 @@ def rounded(value: float, *, up: bool = False) -> float:
 
 def printable(text: str) -> str:
     """The text for a terminal: control characters become `\\x1b` or `\\t`, except line ends, so that none acts."""
-    return (
-        text
-        if text.isprintable()  # also where it has 50 MB
-        else "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
-    )
+    if text.isprintable():  # also where it has 50 MB
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 SENTENCE = 10_000  # characters of the longest one that is shown in one line

@@ -12,7 +12,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -28,11 +28,6 @@ CLAIMED = 1e9  # bytes
 _DAMAGED = (OSError, RuntimeError, LookupError, TypeError, ValueError)  # as h5py says it: nobody can follow that
 
 
-_KNOWN, _MOST_KNOWN = dict[tuple[int, ...], dict[str, None]](), 1000
-"""Files that harmless ones refer to, by what the system says of a file: each write changes that. Whether these are
-regular files is asked each time."""
-
-
 def require_harmless(file: h5py.File) -> None:
     """Raise DataError for a file that it is not safe to read.
 
@@ -40,7 +35,7 @@ def require_harmless(file: h5py.File) -> None:
     it has, or its values lie in another file as plain bytes.
     """
     path = Path(file.filename)
-    for name in _names_in(file, path):
+    for name in dict.fromkeys(_names(file, path)):
         # Where HDF5 looks for it: as it is named, beside this file, and by its last part beside it.
         for place in (Path(name), path.parent / name, path.parent / Path(name).name):
             if place.is_dir():
@@ -51,21 +46,6 @@ def require_harmless(file: h5py.File) -> None:
                 raise DataError(
                     f"{path} links to {name}, which no scan does ({error.strerror}). Nothing was read."
                 ) from error
-
-
-def _names_in(file: h5py.File, path: Path) -> Iterable[str]:
-    """The other files that links and datasets name; those of a file that nobody has written to since are known."""
-    try:
-        now = path.stat()
-    except OSError:  # it has no name any more
-        return dict.fromkeys(_names(file, path))
-    state = now.st_dev, now.st_ino, now.st_size, now.st_mtime_ns, now.st_ctime_ns
-    if state not in _KNOWN:
-        names = dict.fromkeys(_names(file, path))
-        if len(_KNOWN) >= _MOST_KNOWN:
-            _KNOWN.clear()
-        _KNOWN[state] = names
-    return _KNOWN[state]
 
 
 def _names(file: h5py.File, path: Path) -> Iterator[str]:
