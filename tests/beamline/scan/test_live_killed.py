@@ -82,7 +82,6 @@ def test_a_killed_scan_takes_its_live_reconstruction_with_it_and_the_resumed_run
 
 
 @pytest.mark.slow
-@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_a_follower_of_its_own_ends_when_its_scan_is_killed_before_anybody_recovers_the_file(tmp_path: Path) -> None:
     words = [word for each in (*SCAN, "recon.live=false") for word in ("--set", each)]
