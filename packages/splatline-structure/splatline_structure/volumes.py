@@ -198,9 +198,9 @@ def parts_of(
         views=str(facts.get("views", "all")), rows=rows, binning=int(facts.get("binning", 1)), axis_col=record.axis_col,
     )  # fmt: skip
     with open_scan(scan) as source:
-        chosen = selection.of(source)
-        first, end, side = chosen.detector_rows.start, chosen.detector_rows.stop, chosen.binning
-        if chosen.cone is None:
+        selected = selection.of(source)
+        first, end, side = selected.detector_rows.start, selected.detector_rows.stop, selected.binning
+        if selected.cone is None:
             if (end - first) // side != part.count:
                 raise ValueError(f"it has {part.count} slices, and rows {first} to {end} of its scan do not")
             low, high = max(at.start - _BESIDE, 0), min(at.stop + _BESIDE, part.count)
@@ -213,9 +213,9 @@ def parts_of(
     in_pixels = facts.get("pixel_pitch_unit") == "px"
     scale = 1.0 if in_pixels else prepared.geometry.sample_pitch / record.grid.voxel_size  # to the volume's unit
     volumes = []
-    for first in range(count):
-        tell(first, count)
-        chosen = np.sort(order[first::count])
+    for n in range(count):
+        tell(n, count)
+        chosen = np.sort(order[n::count])
         weights = None if views.weights is None else np.asarray(views.weights[chosen], np.float32)
         use = recon.DataUse(weights=weights, sample_radius=prepared.sample_radius)
         made = recon.reconstruct(views.data[chosen], prepared.geometry.select(chosen), record.method, use=use)
