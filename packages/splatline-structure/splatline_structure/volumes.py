@@ -198,9 +198,9 @@ def parts_of(
         views=str(facts.get("views", "all")), rows=rows, binning=int(facts.get("binning", 1)), axis_col=record.axis_col,
     )  # fmt: skip
     with open_scan(scan) as source:
-        chosen = selection.of(source)
-        first, end, side = chosen.detector_rows.start, chosen.detector_rows.stop, chosen.binning
-        if chosen.cone is None:
+        stated = selection.of(source)
+        first, end, side = stated.detector_rows.start, stated.detector_rows.stop, stated.binning
+        if stated.cone is None:
             if (end - first) // side != part.count:
                 raise ValueError(f"it has {part.count} slices, and rows {first} to {end} of its scan do not")
             low, high = max(at.start - _BESIDE, 0), min(at.stop + _BESIDE, part.count)
