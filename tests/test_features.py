@@ -136,8 +136,11 @@ def _environment(root: Path) -> dict[str, str]:
 
 
 def parts_that_tell_apart(names: Sequence[str]) -> list[list[str]]:
-    """Parts of the names such that of any two names each is in one without the other: the codes of equally many ones
-    (Sperner, 1928), of which none is within another."""
+    """Sets of names, such that for any two names some set holds the first without the second.
+
+    Each name has a code of its own, half of some digits; the names with a digit are a set. No code is within another,
+    as all have equally many digits (Sperner, 1928).
+    """
     digits = next(n for n in itertools.count(1) if math.comb(n, n // 2) >= len(names))
     codes = itertools.combinations(range(digits), digits // 2)
     of_each = dict(zip(names, codes, strict=False))
@@ -147,7 +150,7 @@ def parts_that_tell_apart(names: Sequence[str]) -> list[list[str]]:
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="each part has a fork of one process")
 def test_the_core_loads_without_any_one_feature_and_none_needs_another(copied: Path) -> None:
-    """Without parts of them: that any feature loads without any other one is seen in one of these."""
+    """Some features are removed at once, so that each is seen to load without any other one."""
     (copied / "aside").mkdir(exist_ok=True)
     parts = parts_that_tell_apart([name for name in table() if name != "shared"])
     for one, other in itertools.permutations(set(table()) - {"shared"}, 2):

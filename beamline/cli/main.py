@@ -206,7 +206,8 @@ class LazyGroup(click.Group):
         if args[:1] == ["doctor"]:  # its name in version 1.0
             click.echo("`beamline doctor` is now `beamline check CONFIG --connect`.", err=True)
             args = ["check", "--connect", *(word for word in args[1:] if word != "--session")]
-        args = [two, *args[2:]] if (two := " ".join(args[:2])) in ADD_ONS else args
+        if (two := " ".join(args[:2])) in ADD_ONS:
+            args = [two, *args[2:]]
         command = _command(args[0]) if args else None
         if args and command is None and args[0][:1] not in ("", "-"):
             if args[0] in ADD_ONS:

@@ -42,7 +42,8 @@ def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
 
     def terminate(number: int, frame: FrameType | None) -> None:
         stop.stop(f"the process received {signal.Signals(number).name}")
-        to_stderr(f"Stopping cleanly: {stop.reason}.")
+        if not stop.aborting:
+            to_stderr(f"Stopping cleanly, as the process received {signal.Signals(number).name}. Ctrl-C aborts.")
 
     def keep_on(number: int, frame: FrameType | None) -> None:
         to_stderr("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")

@@ -107,17 +107,18 @@ def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
     return lambda: useless or (stop.stopping and stop.seconds >= last)
 
 
-def told_while_it_ends(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], bool]:
-    """Whether the scan was aborted, so that its live reconstruction should be killed. Asked while that ends, it says
-    how long a stopped scan has waited for the volume: at once, then every 5 s."""
-    due, most = 0.0, ASK_LIVE_AFTER + _GRACE
+def aborting_else_told(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], bool]:
+    """Whether a scan that has ended was aborted, so that its live reconstruction should be killed. Each answer may tell
+    how long a stopped scan has waited for the volume since its stop: the first one, then every 5 s."""
+    asked_at = max(stop.seconds, ASK_LIVE_AFTER) if stop.stopping else 0.0  # for the volume, see `live_should_end`
+    due, most = 0.0, asked_at + _GRACE
 
     def aborting() -> bool:
         nonlocal due
         if stop.stopping and not stop.aborting and stop.seconds >= due:
             due = stop.seconds + _SAY_EVERY
             waited = f"{stop.seconds:.0f} of at most {most:.0f} s"
-            say(f"Waiting for the live volume of the views so far: {waited}. Ctrl-C or an abort ends without it")
+            say(f"Waiting for the live volume of the views so far: {waited}. Ctrl-C ends the scan without it")
         return stop.aborting
 
     return aborting
@@ -195,7 +196,7 @@ class LiveReconstruction:
 
         Args:
             stop: polled a few times a second; True asks it to end with its present volume.
-            hurry: polled in the same way, and while it ends; True kills it.
+            hurry: polled in the same way, and while it ends; True kills it. It may tell how long that takes.
         """
         with self._changing:
             process, self._wanted = self._process, False

@@ -133,7 +133,7 @@ def cases() -> Mapping[str, Callable[[], list[Row]]]:
 
 
 CASES = cases()
-QUICK = [*SCANS][::80]
+QUICK = [*SCANS][::80]  # two or three small scans, in each quick run
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
@@ -187,10 +187,8 @@ def marked() -> list[Any]:
             in_gate.add(name)
         sentences |= said[name]
     slow, long = pytest.mark.slow, (pytest.mark.slow, pytest.mark.long)
-    marks = [
-        pytest.param(name, (), marks=() if name in QUICK else slow if name in in_gate else long, id=name)
-        for name in said
-    ]
+    of_name = dict.fromkeys(said, long) | dict.fromkeys(in_gate, (slow,)) | dict.fromkeys(QUICK, ())
+    marks = [pytest.param(name, (), marks=of_name[name], id=name) for name in said]
     for name in [name for name in CASES if name not in said]:
         if files := new_files(recorded().get(name, []), sentences):
             marks.append(pytest.param(name, files, marks=slow, id=name))

@@ -127,6 +127,8 @@ class RideProgram:
     and kills it at its end.
 
     Args:
+        folder: of its configuration, runs and output.
+        image: the channel of the images.
         options: of the command.
         program: what Python runs instead.
         ride: settings of the section.
@@ -168,5 +170,6 @@ class RideProgram:
                 return int(file["/entry/progress/frames_committed"][()])
         return 0
 
-    def end(self, seconds: float = 400.0) -> int:
+    def exit_code(self, seconds: float = 400.0) -> int:
+        """Wait for its end, at most so long."""
         return self.process.wait(seconds)

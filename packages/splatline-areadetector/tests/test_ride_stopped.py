@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM while frames come and a live volume is made beside them: both are answered within 2 s."""
+"""Ctrl-C and SIGTERM while frames come and a live volume is made: both are answered within 2 s of a free core."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.usefixtures("loopback"),
     pytest.mark.skipif(sys.platform == "win32", reason="no test sends Ctrl-C to one program alone there"),
 ]
-WITHIN = 2.0  # s, on a free core
+WITHIN, LATEST = 2.0, 30.0  # s: each on a free core; by the clock for all, also of a busy machine
 SHAPES = {10: (2048, 2048), 50: (64, 96)}  # by frames/s
 
 
@@ -88,12 +88,13 @@ def test_a_stop_closes_the_file_and_a_second_ends_the_ride(tmp_path: Path, fps: 
             full_speed()
             ride.wait_for(lambda: ride.frames() > before + fps)
             ride.process.send_signal(number)
+            begin = time.monotonic()
             answered = _seconds(lambda: "Stopping cleanly" in ride.output, ride)
             closed = answered + _seconds(lambda: "Waiting for the live volume" in ride.output, ride)
             ride.process.send_signal(signal.SIGINT)
             ended = _seconds(lambda: ride.process.poll() is not None, ride)
         print(f"answered after {answered:.2f} s, file closed after {closed:.2f} s; ended {ended:.2f} s after Ctrl-C")
-        assert ride.end() == 4 and "Aborting" in ride.output, ride.output
-    assert answered < WITHIN and closed < WITHIN and ended < WITHIN
+        assert ride.exit_code() == 4 and "Aborting" in ride.output, ride.output
+    assert answered < WITHIN and closed < WITHIN and ended < WITHIN and time.monotonic() - begin < LATEST
     (file,) = stored(tmp_path)
     assert file.status == "stopped" and file.ids.tolist() == [-1] * 4 + [*range(1, len(file.ids) - 3)]

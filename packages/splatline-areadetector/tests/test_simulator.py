@@ -94,7 +94,7 @@ def _equal_to_the_bit(file: Stored, source: Path, step: float = 2.0) -> None:
 def _on_schedule(file: Stored, fps: float) -> None:
     """The server sent each frame when it was due, by its own clock: no client slowed it."""
     late = file.times - file.times[0] - (file.ids - file.ids[0]) / fps
-    assert np.abs(late - np.median(late)).max() < 0.8, late
+    assert np.abs(late - np.median(late)).max() < 0.8, late  # s: of the machine itself, at load 10
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_every_frame_once(tmp_path: Path, scan: Path, fps: int, seconds: int) ->
     given = ("--darks", str(scan), "--flats", str(scan))
     with served(scan, fps) as start, RideProgram(tmp_path, IMAGE, "--no-live", *given, **_views(n)) as ride:
         start()
-        assert ride.end() in (0, 7), ride.output  # 7: the monitor sees that the scan comes over and over
+        assert ride.exit_code() in (0, 7), ride.output  # 7: the monitor sees that the scan comes over and over
     (file,) = stored(tmp_path)
     _equal_to_the_bit(file, scan)
     assert file.ids.tolist() == [-1, -1, *range(1, n + 1)] and file.status == "complete"
@@ -126,7 +126,7 @@ def test_two_rides_and_a_viewer_of_one_server(tmp_path: Path, scan: Path) -> Non
         assert watching.stdout is not None and watching.stdout.readline() == b"ready\n"
         start()
         seen = [watching.stdout.readline() for _ in range(20)]
-        assert all(ride.end() in (0, 7) for ride in rides), [ride.output for ride in rides]
+        assert all(ride.exit_code() in (0, 7) for ride in rides), [ride.output for ride in rides]
     with h5py.File(scan) as source:
         frames = source["/exchange/data"][()]
     assert all(int(words[1]) == zlib.crc32(frames[int(words[0]) - 1].tobytes()) for words in map(bytes.split, seen))
@@ -170,7 +170,7 @@ def test_the_page_shows_a_growing_volume_and_the_last_is_that_of_the_file(tmp_pa
 
         ride.wait_for(shows_a_volume, 300)
         during = ride.frames()
-        assert ride.end(600) in (0, 7), ride.output
+        assert ride.exit_code(600) in (0, 7), ride.output
     assert during < n, "the picture came after the last frame"
     (run,) = (tmp_path / "runs").glob("*/")
     (file,) = stored(tmp_path)
@@ -206,7 +206,7 @@ def test_a_ride_that_stands_still(tmp_path: Path, scan: Path, still: int, whole:
         time.sleep(still)
         for each in stopped:
             each.resume()
-        code = ride.end()
+        code = ride.exit_code()
     (file,) = stored(tmp_path)
     _equal_to_the_bit(file, scan)
     _on_schedule(file, 50)
@@ -227,7 +227,7 @@ def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, scan: Path) -> N
         ride.wait_for(lambda: "its server has gone" in ride.output)
         with served(scan, 20) as start:
             start()
-            assert ride.end() == 5
+            assert ride.exit_code() == 5
     assert "began anew at" in ride.output
     first, second = stored(tmp_path)
     assert first.status == "failed" and second.status == "complete" and second.ids[0] < 60  # found again soon
@@ -239,15 +239,15 @@ def test_a_server_that_is_killed_and_comes_back(tmp_path: Path, scan: Path) -> N
 @pytest.mark.parametrize("ring", [2048.0, 5.0])
 @pytest.mark.slow
 def test_a_disk_of_5_mb_s(tmp_path: Path, scan: Path, ring: float) -> None:
-    """Frames of 173 kB at 80 a second: 13.8 MB/s. A ring that is large enough loses none. A small one is full after
-    6 s, and so are the 128 frames of the recorder."""
+    """Frames of 173 kB at 80 a second: 13.8 MB/s. A ring that is large enough loses none. A small one, and the 128
+    frames of the recorder, are full after about 3 s."""
     n, fps, source = 500, 80, tmp_path / "large.h5"
     with h5py.File(scan) as file, h5py.File(source, "w") as large:
         large["/exchange/data"] = file["/exchange/data"][:].repeat(2, 1).repeat(2, 2)
     options: dict[str, Any] = {"program": DISK.format(bytes_per_s=5e6), "ring_mb": ring, "period_s": 1 / fps}
     with served(source, fps) as start, RideProgram(tmp_path, IMAGE, "--no-live", **options, **_views(n)) as ride:
         start()
-        code = ride.end()
+        code = ride.exit_code()
     (file,) = stored(tmp_path)
     _equal_to_the_bit(file, source)
     _on_schedule(file, fps)
@@ -266,7 +266,7 @@ def test_a_ride_that_is_killed_is_recovered(tmp_path: Path, scan: Path) -> None:
         ride.wait_for(lambda: ride.frames() > 30)
         committed = ride.frames()
         ride.process.kill()
-        ride.end()
+        ride.exit_code()
     (run,) = (tmp_path / "runs").glob("*/")
     time.sleep(10)  # for so long a file counts as being written
     command = [sys.executable, "-m", "beamline.cli.main", "recover", str(run)]
@@ -303,7 +303,7 @@ def test_large_frames_for_a_minute(tmp_path: Path, record_property: Callable[[st
             except psutil.Error:
                 break
             time.sleep(0.5)
-        code = ride.end()
+        code = ride.exit_code()
     record_property("cpu_s", cpu)
     record_property("memory_gb", most)
     print(f"{n} frames of 8.4 MB: {cpu:.1f} s of CPU, {most:.2f} GB at most")

@@ -31,8 +31,9 @@ they refuse few materials at 90 views of 256 columns: trials take 0.08 over the 
 DOUBT = 0.16
 """Error of a voxel near half way between two levels, over their gap, for `undecided_share`. Set on packed grains of 36
 views, before levels were drawn apart. Since, expected and wrong: packed grains from 60 views 2.1 and 2.1 %, from 36 2.5
-and 2.9 %; a cathode from 45 views 2.4 and 2.3 %; ellipsoids from 36 1.1 and 1.0 %. Of the 84 to 93 % of voxels expected
-wrong by less than 1 %, up to 0.1 % are; of those by 10 to 20 %, 13 to 19 %; of those by 40 % and more, 45 %."""
+and 2.9 %; a cathode from 45 views 2.4 and 2.3 %; ellipsoids from 36 1.1 and 1.0 %. Of voxels that are wrong with an
+expected probability of 10 to 20 %, 13 to 19 % are; of 40 % and more, 45 %; of less than 1 %, as 84 to 93 % of all, up
+to 0.1 %."""
 THIN = 0.2
 """Over the gap of levels: what is one or two voxels thick and stands out by more before the pull is not pulled towards
 what is on both sides of it. Without, cracks of half a voxel to one voxel go from 0.97 to 0.90 of their depth by total

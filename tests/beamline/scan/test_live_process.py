@@ -247,19 +247,31 @@ def test_the_time_to_the_volume_of_a_stopped_scan_counts_from_the_signal() -> No
     assert ends()
 
 
-def test_how_long_the_volume_of_a_stopped_scan_is_waited_for_is_said_at_once_and_every_5_s() -> None:
+@pytest.mark.parametrize(
+    ("ended_after", "most"),
+    [(None, 120), (1.0, 124), (30.0, 150)],
+    ids=["stopped while its volume is waited for", "ended soon after its stop", "ended late after its stop"],
+)
+def test_how_long_the_volume_of_a_stopped_scan_is_waited_for_is_said_at_once_and_every_5_s(
+    ended_after: float | None, most: int
+) -> None:
     seconds, told = 100.0, list[str]()
     stop = StopRequest(now=lambda: seconds)
-    aborting = live_process.told_while_it_ends(stop, told.append)
-    assert not aborting() and not told
-    stop.stop()
-    for after in (0.5, 1.0, 5.0, 5.6):
-        seconds = 100.0 + after
+    if ended_after is not None:
+        stop.stop()
+        seconds += ended_after
+    aborting = live_process.aborting_else_told(stop, told.append)
+    if ended_after is None:
+        assert not aborting() and not told
+        stop.stop()
+    first, begin = round(ended_after or 0), seconds
+    for after in (0.0, 1.0, 4.5, 5.0):
+        seconds = begin + after
         assert not aborting()
     waiting = "Waiting for the live volume of the views so far"
-    assert [text.split(".")[0] for text in told] == [f"{waiting}: {n} of at most 124 s" for n in (0, 6)]
+    assert [text.split(".")[0] for text in told] == [f"{waiting}: {first + n} of at most {most} s" for n in (0, 5)]
     stop.abort()
-    seconds = 200.0
+    seconds += 100.0
     assert aborting() and len(told) == 2
 
 

@@ -113,7 +113,9 @@ def test_a_few_schedules(rig_of: RigOf, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("first", "last"), [(8, 16), pytest.param(16, 42, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ("first", "last"), [(8, 16), *(pytest.param(*seeds, marks=pytest.mark.long) for seeds in ((2, 8), (16, 42)))]
+)
 def test_many_schedules(rig_of: RigOf, tmp_path: Path, first: int, last: int) -> None:
     ends = [scheduled(rig_of, tmp_path / str(seed), seed) for seed in range(first, last)]
     assert {State.DONE, State.STOPPED, State.FAILED} <= set(ends)

@@ -82,10 +82,10 @@ def test_views_held_out_tell_the_length_of_fringes(square: float) -> None:
     np.testing.assert_array_equal(views, kept)
 
 
-def test_a_filter_that_gains_far_too_little_is_not_looked_at_closely() -> None:
+def test_a_filter_that_gains_too_little_is_sought_in_whole_octaves_alone() -> None:
     views, geometry = views_of_can(0.1)
     shown = length_by_held_out_views(views, geometry, FLOOR, np.ones(views.shape[1:], np.bool_))
-    assert shown is not None and shown.factor == math.inf and 0 < shown.gain < LEAST_DROP
+    assert shown is not None and shown.factor == math.inf and 0 < shown.gain < 0.9 * LEAST_DROP
     assert 0.04 < shown.length**2 < 0.12  # 0.063 by half octaves
 
 

@@ -15,12 +15,12 @@ INTERPRETED = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarn
 @pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Of each law the first case is interpreted in the gate, the others before a release."""
-    known = set[tuple[Path, str]]()
+    seen = set[tuple[Path, str]]()
     for item in items:
-        if isinstance(item, pytest.Function) and "on" in item.fixturenames and "[gpu" in item.name:
-            if (law := (item.path, item.originalname)) in known:
+        if isinstance(item, pytest.Function) and hasattr(item, "callspec") and item.callspec.params.get("on") is gpu:
+            if (law := (item.path, item.originalname)) in seen:
                 item.add_marker(pytest.mark.long)
-            known.add(law)
+            seen.add(law)
 
 
 @pytest.fixture(params=[pytest.param(cpu, id="cpu"), pytest.param(gpu, id="gpu", marks=INTERPRETED)])
