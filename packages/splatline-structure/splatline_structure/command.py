@@ -16,10 +16,10 @@ from beamline.core.text import count, memory_size, safe_name
 
 if TYPE_CHECKING:
     from splatline_structure.intervals import Found
-    from splatline_structure.volumes import Box, Part
+    from splatline_structure.volumes import Box, ReadSlices
 
 _FILE = click.Path(path_type=Path)
-FEWEST = 16  # views that can be parted, 8 of each half
+FEWEST_VIEWS = 16  # that can be parted, 8 of each half
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Seen:
     """
 
     path: Path
-    part: Part
+    read: ReadSlices
     box: Box
     grid: Any
     volume: Any
@@ -61,7 +61,11 @@ class Seen:
     help="Material whose connected share and tortuosity are taken.",
 )
 @click.option(
-    "--parts", metavar="A B", type=_FILE, nargs=2, help="The volume from every other view, and from the others."
+    "--parts",
+    metavar="A B",
+    type=_FILE,
+    nargs=2,
+    help="The volume from every other view, and from the others: all slices, or only those that are measured.",
 )
 @click.option(
     "--scan",
@@ -140,19 +144,20 @@ def _seen(path: Path, answer: Answer, **values: Any) -> Seen:
     from splatline_structure.intervals import with_all_slices
     from splatline_structure.volumes import box_in, read_volume, slabs_of
 
-    memory = values["memory"] or free_memory()
     crop = values["crop"] == "square"
-    part = read_volume(path, values["dataset"], values["voxel_um"], values["slices"], memory, crop)
-    if part.limit:
-        answer.warn(f"{path}: {part.limit}")
-    seen = measured(path, part, box_in(part.record.volume.data, crop), answer, **values)
-    if not part.limit:
+    read = read_volume(
+        path, values["dataset"], values["voxel_um"], values["slices"], values["memory"] or free_memory(), crop
+    )
+    if read.limit_sentence:
+        answer.warn(f"{path}: {read.limit_sentence}")
+    seen = measured(path, read, box_in(read.record.volume.data, crop), answer, **values)
+    if not read.limit_sentence:
         return seen
-    slabs = slabs_of(path, values["dataset"], part, seen.box)
-    return replace(seen, found=with_all_slices(seen.found, slabs, answer.counting("slabs")))
+    slabs = slabs_of(path, values["dataset"], read, seen.box, answer.counting("slabs"))
+    return replace(seen, found=with_all_slices(seen.found, slabs))
 
 
-def measured(path: Path, part: Part, box: Box, answer: Answer, **values: Any) -> Seen:
+def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: Any) -> Seen:
     """What was found in the slices of a volume.
 
     Args:
@@ -172,19 +177,19 @@ def measured(path: Path, part: Part, box: Box, answer: Answer, **values: Any) ->
             f"Material {max(particles, values['through'])} of {n_materials}: they are numbered from 1. Nothing was "
             "written."
         )
-    grid, data, parts = part.record.grid.part(*box), part.record.volume.data, []
-    for half in _parts(path, part, answer, **values):
+    grid, data, parts = read.record.grid.part(*box), read.record.volume.data, []
+    for half in _parts(path, read, answer, **values):
         if half.shape != data.shape:
-            raise ValueError(f"a part of its views has {half.shape} voxels, not {data.shape}")
+            raise ValueError(f"the volume from half of its views has the shape {half.shape}, not {data.shape}")
         parts.append(np.ascontiguousarray(half[box]))
     rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
     dz, dy, dx = (1e3 * edge for edge in grid.spacing)
     volume = np.ascontiguousarray(data[box])
     found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("structures"))
-    return Seen(path, part, box, grid, volume, found)
+    return Seen(path, read, box, grid, volume, found)
 
 
-def _parts(path: Path, part: Part, answer: Answer, **values: Any) -> list[Any]:
+def _parts(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> list[Any]:
     """The slices of the volume from each half of its views; none where they are not asked for, or not there."""
     from beamline.storage.volumes.files import opened_volume
     from splatline_structure.volumes import parts_of
@@ -195,29 +200,33 @@ def _parts(path: Path, part: Part, answer: Answer, **values: Any) -> list[Any]:
         halves = []
         for half in values["parts"]:
             with opened_volume(half) as opened:
-                halves.append(opened.volume.data[part.slices if opened.grid.shape[0] == part.count else slice(None)])
+                if opened.grid.shape[0] == read.n_slices:
+                    halves.append(opened.volume.data[read.slices])
+                else:  # it holds these slices alone
+                    halves.append(opened.volume.data[:])
         return halves
-    scan = values["scan"] or Path(part.record.raw_file)
+    scan = values["scan"] or Path(read.record.raw_file)
     if not scan.is_file():
         answer.warn(
             f"{path}: its scan is not there ({scan}): the intervals are without what the views do. Give --scan or "
             "--parts."
         )
         return []
-    if (n_views := int(part.record.parameters.get("n_views", FEWEST))) < FEWEST:
+    if (n_views := int(read.record.parameters.get("n_views", FEWEST_VIEWS))) < FEWEST_VIEWS:
         raise ValueError(f"{n_views} views are too few to be parted: give --quick")
-    return parts_of(part, scan, 2, answer.warn, answer.counting("halves of the views"))
+    return parts_of(read, scan, 2, answer.warn, answer.counting("halves of the views"))
 
 
 def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any], answer: Answer) -> None:
     """Write the folder, and say what is in it."""
+    from beamline.core.events import json_of
     from beamline.report.html import Picture
     from splatline_structure import pictures, results
     from splatline_structure.intervals import difference
 
     first = seen[0]
     table = first.found.intervals
-    shown = pictures.pictures_of(first.found, first.volume, first.grid, first.part)
+    shown = pictures.pictures_of(first.found, first.volume, first.grid, first.read)
     title = f"{seen[1].path.name} less {first.path.name}" if compare else f"Structure of {first.path.name}"
     settings = {
         "volume": first.path,
@@ -225,31 +234,40 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
         "command": " ".join(("beamline structure", *(str(each.path) for each in seen))),
     }
     states = [
-        results.facts_of(each.found, {**settings, "volume": each.path, "box": each.voxels(each.part.slices)})
+        results.facts_of(each.found, {**settings, "volume": each.path, "box": each.voxels(each.read.slices)})
         for each in seen
     ]
     if compare:
-        other = seen[1].found.intervals
-        table = {name: difference(each, other[name]) for name, each in table.items() if name in other}
+        one, other = table, seen[1].found.intervals
+        table = {name: difference(each, other[name]) for name, each in one.items() if name in other}
+        if one.keys() != other.keys():
+            answer.warn(
+                "Memory holds all slices of only one of the two volumes: numbers named _all are not compared. Free "
+                "memory, give more --memory, or give --slices that it holds of both."
+            )
     if len(seen) > 1:
         curves = {
             name: [each.found.intervals[name] for each in seen]
             for name, interval in first.found.intervals.items()
             if not interval.why_not and all(name in each.found.intervals for each in seen)
         }
-        at = [float(each.part.record.parameters.get("time_s", k)) for k, each in enumerate(seen)]
-        drawn = [pictures.curves_of(curves, at, "volume")] if curves else []
-        shown = [*(Picture("Numbers of all volumes", "Values with their intervals.", each) for each in drawn), *shown]
+        at = [float(each.read.record.parameters.get("time_s", k)) for k, each in enumerate(seen)]
+        if curves:
+            drawn = pictures.curves_of(curves, at, "volume")
+            shown.insert(0, Picture("Numbers of all volumes", "Values with their intervals.", drawn))
     particles = first.found.structure.particles
     undecided = (
         f"{first.found.undecided:.1%} of the voxels are undecided; "
         f"{count(particles.label.size, 'particle')}, {int(particles.cut.sum())} cut by a face of the box."
     )
-    limits = [f"{each.path}: {each.part.limit}" for each in seen if each.part.limit]
+    limits = [f"{each.path}: {each.read.limit_sentence}" for each in seen if each.read.limit_sentence]
+    in_table = seen if compare else [first]
+    box = " and ".join(each.voxels(each.read.slices) for each in in_table)
+    box_of_all = " and ".join(each.voxels(each.read.asked) for each in in_table)
     texts = {
         "report.html": results.page(title, undecided, limits, shown, table, settings),
-        "numbers.csv": results.numbers_table(table, *map(first.voxels, (first.part.slices, first.part.asked))),
-        "structure.json": results.json_text(states[0] if len(seen) == 1 else {"states": states}),
+        "numbers.csv": results.numbers_table(table, box, box_of_all),
+        "structure.json": json_of(states[0] if len(seen) == 1 else {"states": states}),
         "particles.csv": results.particles_table(particles, first.grid),
     }
     labels: dict[str, Any] = {
@@ -257,7 +275,7 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
         f"particles.{values['labels']}": first.found.structure.numbered,
     }
     with atomic_file(output) as partial:
-        results.write_all(partial, texts, labels, first.part.record, first.grid)
+        results.write_all(partial, texts, labels, first.read.record, first.grid)
     answer.done(
         {"output": output, **states[0]}, title, *results.lines_of(table), undecided, *limits, f"output  {output}"
     )

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from splatline_structure.materials import F32, F64, Materials, labelled, materials_of, probabilities
 from splatline_structure.numbers import Rules, Structure, coarse, shares_of, structure_of
 from splatline_structure.particles import Particles, Spacing
-
-Told = Callable[[int, int], None]
-Numbers = Mapping[str, float]
 
 BIAS_UNSURE, NOISE = 0.5, 1.5
 """Half-width by the views: over what half of them change a number by, and over half the difference of both halves."""
@@ -37,6 +35,9 @@ CAUSES = {
     "voxels": "the size of a voxel decides this, not the views",
     "particles": "more whole particles would narrow this: a larger field",
 }
+_NO_CAUSE = (
+    f"no cause changes this number; the interval is the narrowest that is given ({100 * NARROWEST:g} % to a side)"
+)
 _SHARES = "fraction", "sphericity", "cracks", "connected"
 
 
@@ -69,7 +70,7 @@ class Interval:
     @property
     def words(self) -> str:
         """What the interval comes from, or why there is none."""
-        return self.why_not or (CAUSES[self.decides] if getattr(self, self.decides) > 0 else "nothing moves this")
+        return self.why_not or (CAUSES[self.decides] if getattr(self, self.decides) > 0 else _NO_CAUSE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,11 +78,12 @@ class Found:
     """All that a volume says of its structure.
 
     Attributes:
-        intervals: by the names of `Structure.numbers`.
+        intervals: by the names of `Structure.numbers`, and those of `with_all_slices`.
         undecided: share of voxels without a material of probability 0.8.
         unsure: bool [z, y, x], these voxels.
         parts: structures of volumes from parts of the views.
         off: share of a gap of levels by which thresholds may lie off.
+        rules: by which the numbers were taken.
         spacing: edges of a voxel (z, y, x), µm.
         along_all: share of the particles' material in each slice, also of those beyond the ones looked at.
     """
@@ -99,7 +101,12 @@ class Found:
 
 
 def found_in(
-    volume: F32, parts: Sequence[F32], count: int, spacing: Spacing, rules: Rules, tell: Told = lambda n, of: None
+    volume: F32,
+    parts: Sequence[F32],
+    count: int,
+    spacing: Spacing,
+    rules: Rules,
+    tell: Callable[[int, int], None] = lambda n, of: None,
 ) -> Found:
     """The structure of a volume, its numbers with intervals.
 
@@ -127,10 +134,10 @@ def found_in(
         moved.append(float(np.abs((thresholds - materials.thresholds) / gaps).max()))
         halves.append(structure_of(part, thresholds, spacing, rules))
         tell(1 + len(halves), steps)
-    sides = []
-    for sign in (1, -1):
-        sides.append(structure_of(volume, materials.thresholds + sign * PROBED * gaps, spacing, rules).numbers)
-        tell(1 + len(halves) + len(sides), steps)
+    sides = [
+        structure_of(volume, materials.thresholds + sign * PROBED * gaps, spacing, rules).numbers for sign in (1, -1)
+    ]
+    tell(3 + len(halves), steps)
     dz, dy, dx = spacing
     wide = structure_of(coarse(volume), materials.thresholds, (2 * dz, 2 * dy, 2 * dx), rules.of_coarse_voxels).numbers
     tell(steps, steps)
@@ -187,44 +194,49 @@ def _interval(
     moves, views = still * change, math.hypot(BIAS_UNSURE * change, NOISE * float(np.ptp(halves or [0.0])) / 2)
     levels = abs(sides[0] - sides[1]) / 2 * off / PROBED
     voxels = of_voxels * abs(wide - value)
-    half = max(math.hypot(np.nan_to_num(views), levels, voxels, of_particles), NARROWEST * abs(value))
-    middle = value + float(np.nan_to_num(moves))
-    low = max(middle - half, float(kind == "tortuosity"))
-    return _within(kind, Interval(value, low, middle + half, moves, views, levels, voxels, of_particles))
+    return _judged(
+        kind, Interval(value, moves=moves, views=views, levels=levels, voxels=voxels, particles=of_particles)
+    )
 
 
-def _within(kind: str, interval: Interval) -> Interval:
-    """The interval of a share ends at 1; one that is too wide determines nothing."""
-    low, high = interval.low, min(interval.high, 1.0) if kind in _SHARES else interval.high
+def _judged(kind: str, interval: Interval) -> Interval:
+    """With the ends by its half-widths, within what such a number can be; one that is too wide determines nothing."""
+    by_cause = [float(np.nan_to_num(getattr(interval, cause))) for cause in CAUSES]
+    half = max(math.hypot(*by_cause), NARROWEST * abs(interval.value))
+    middle = interval.value + float(np.nan_to_num(interval.moves))
+    low = max(middle - half, 1.0 if kind == "tortuosity" else 0.0)
+    high = min(middle + half, 1.0 if kind in _SHARES else math.inf)
     why = f"the interval is {low:.3g} to {high:.3g}, wider than half of the value"
-    return replace(interval, high=high, why_not=why if high - low > WIDEST * abs(interval.value) else "")
+    return replace(interval, low=low, high=high, why_not=why if high - low > WIDEST * abs(interval.value) else "")
 
 
-def with_all_slices(found: Found, slabs: Iterable[F32], tell: Told = lambda n, of: None) -> Found:
-    """With fractions and surface of all slices, named `_all`: intervals are as wide as those of the middle ones.
+def with_all_slices(found: Found, slabs: Iterable[F32]) -> Found:
+    """With fractions and surface of all slices, named `_all`, whose half-widths are those of the middle ones.
 
     Args:
         slabs: all slices, some at a time.
-        tell: gets slabs taken.
     """
-    numbers, along = list[Numbers](), list[F64]()
+    numbers, along = list[dict[str, float]](), list[F64]()
     for slab in slabs:
         labels = labelled(slab, found.materials.thresholds)
         numbers.append(shares_of(labels, found.materials.levels.size, found.spacing, found.rules))
         along.append((labels == found.rules.particles - 1).mean(axis=(1, 2)))
-        tell(len(along), 0)
     intervals = dict(found.intervals)
     for name in numbers[0]:
         value = float(np.average([each[name] for each in numbers], weights=list(map(len, along))))
-        off = value - (middle := found.intervals[name]).value
-        moved = replace(middle, value=value, low=max(middle.low + off, 0.0), high=middle.high + off)
-        intervals[f"{name}_all"] = moved if moved.why_not else _within(name.split("_")[0], moved)
+        of_all = replace(found.intervals[name], value=value)
+        # Without ends nothing of the volume is determined, and why holds for all slices.
+        intervals[f"{name}_all"] = of_all if math.isnan(of_all.low) else _judged(name.split("_")[0], of_all)
     return replace(found, intervals=intervals, along_all=np.concatenate(along))
 
 
 def difference(one: Interval, other: Interval) -> Interval:
-    """Of two states: the second less the first, with the intervals' half-widths added in squares."""
+    """Of two states: the second less the first, with the intervals' half-widths added in squares, also by cause."""
     value, middle = other.value - one.value, (other.high + other.low - one.high - one.low) / 2
     half = math.hypot((one.high - one.low) / 2, (other.high - other.low) / 2)
+    causes: dict[str, Any] = {cause: math.hypot(getattr(one, cause), getattr(other, cause)) for cause in CAUSES}
     alike = "no change is told from none" if abs(middle) < half else ""
-    return Interval(value, middle - half, middle + half, why_not=one.why_not or other.why_not or alike)
+    return Interval(
+        value, middle - half, middle + half, other.moves - one.moves,
+        why_not=one.why_not or other.why_not or alike, **causes,
+    )  # fmt: skip

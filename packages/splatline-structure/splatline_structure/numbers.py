@@ -82,9 +82,9 @@ def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -
     whole, inside = ~particles.cut, numbered > 0
     numbers = shares_of(labels, len(thresholds) + 1, spacing, rules)
     numbers |= {f"size_{share}": particles.quantile(share / 100) for share in (10, 50, 90)}
-    numbers["sphericity"] = _of(particles.sphericity[whole], np.median)
-    numbers["contacts"] = _of(np.array([len(each) for each in particles.neighbours])[whole])
-    numbers["cracks"] = _of(~mask[inside])
+    numbers["sphericity"] = _or_nan(np.median, particles.sphericity[whole])
+    numbers["contacts"] = _or_nan(np.mean, np.array([len(each) for each in particles.neighbours])[whole])
+    numbers["cracks"] = _or_nan(np.mean, ~mask[inside])
     through = labels == rules.through - 1
     for axis, name in enumerate("zyx"):
         share = int(connecting(through, axis).sum()) / max(int(through.sum()), 1)
@@ -116,5 +116,5 @@ def _radial(mask: np.ndarray, spacing: Spacing) -> tuple[F64, F64]:
     return share, (np.arange(ring.max() + 1) + 0.5) * 2 * spacing[2]
 
 
-def _of(values: np.ndarray, take: Callable[[np.ndarray], Any] = np.mean) -> float:
-    return float(take(values)) if values.size else math.nan
+def _or_nan(statistic: Callable[[np.ndarray], Any], values: np.ndarray) -> float:
+    return float(statistic(values)) if values.size else math.nan

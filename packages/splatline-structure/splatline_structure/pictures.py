@@ -13,25 +13,38 @@ from beamline.report.html import Picture
 from recon import Grid
 from splatline_structure.intervals import CAUSES, Found, Interval
 from splatline_structure.materials import F32
-from splatline_structure.volumes import Part
+from splatline_structure.volumes import ReadSlices
 
 
-def pictures_of(found: Found, volume: F32, grid: Grid, part: Part) -> list[Picture]:
-    """All pictures of a page."""
-    band = ", halves of the views as a band" * bool(found.parts)
-    drawn = {
-        "Materials": ("The middle slice, its labels (undecided: red), and particles.", slices(found, volume, grid)),
-        "Sizes": (
-            f"Share of the volume of whole particles below a diameter{band}; lines: intervals of the sizes.",
-            b"" if found.structure.particles.cut.all() else sizes(found),
+def pictures_of(found: Found, volume: F32, grid: Grid, read: ReadSlices) -> list[Picture]:
+    """All pictures of a page; of sizes only where a particle is whole."""
+    with_band = ", halves of the views as a band" if found.parts else ""
+    shown = [
+        Picture(
+            "Materials",
+            "The middle slice, its labels (undecided: red), and particles.",
+            slices(found, volume, grid),
+        )
+    ]
+    if not found.structure.particles.cut.all():
+        shown.append(
+            Picture(
+                "Sizes",
+                f"Share of the volume of whole particles below a diameter{with_band}; lines: intervals of the sizes.",
+                sizes(found),
+            )
+        )
+    return [
+        *shown,
+        Picture(
+            "Profiles",
+            f"Share of the particles' material{with_band}{'; grey: of all slices' if read.limit_sentence else ''}.",
+            profiles(found, grid, read),
         ),
-        "Profiles": (
-            f"Share of the particles' material{band}{'; grey: of all slices' if part.limit else ''}.",
-            profiles(found, grid, part),
+        Picture(
+            "What decides", "Half-width of the interval of each number that is determined.", causes(found.intervals)
         ),
-        "What decides": ("Half-width of the interval of each number that is determined.", causes(found.intervals)),
-    }
-    return [Picture(title, caption, image) for title, (caption, image) in drawn.items() if image]
+    ]
 
 
 def slices(found: Found, volume: F32, grid: Grid) -> bytes:
@@ -69,14 +82,14 @@ def sizes(found: Found) -> bytes:
     return png(figure)
 
 
-def profiles(found: Found, grid: Grid, part: Part) -> bytes:
+def profiles(found: Found, grid: Grid, read: ReadSlices) -> bytes:
     """The share of the particles' material along z (of all slices in grey), and in rings around the middle."""
     structures = [found.structure, *found.parts]
     figure = new_figure((WIDTH, 2.8))
     left, right = np.ravel(figure.subplots(1, 2, sharey=True))
     z = grid.coordinates()[0]
     if found.along_all is not None:
-        all_z = z[0] + grid.spacing[0] * (np.arange(part.asked.start, part.asked.stop) - part.slices.start)
+        all_z = z[0] + grid.spacing[0] * (np.arange(read.asked.start, read.asked.stop) - read.slices.start)
         left.plot(all_z, found.along_all, color="0.6")
     _banded(left, z, [each.along_z for each in structures])
     finish(left, "z (mm)", "share", grid=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -76,24 +74,6 @@ def facts_of(found: Found, settings: Mapping[str, Any]) -> dict[str, Any]:
         "along_z": found.structure.along_z.tolist(), "radial": found.structure.radial[0].tolist(),
         "radii_um": found.structure.radial[1].tolist(),
     }  # fmt: skip
-
-
-def json_text(facts: Mapping[str, Any]) -> str:
-    return json.dumps(_plain(facts), indent=1, allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {name: _plain(each) for name, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(each) for each in value]
-    return (
-        None
-        if isinstance(value, float) and not math.isfinite(value)
-        else str(value)
-        if isinstance(value, Path)
-        else value
-    )
 
 
 def write_labels(path: Path, labels: np.ndarray, record: Any, grid: Grid) -> None:

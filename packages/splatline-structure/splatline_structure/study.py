@@ -13,14 +13,14 @@ from beamline.cli.terminal import answering
 from beamline.core.errors import DataError
 from beamline.core.files import atomic_file, refuse_existing, write_whole
 from beamline.core.text import csv_text, safe_name
-from splatline_structure.command import FEWEST, measured
+from splatline_structure.command import FEWEST_VIEWS, measured
 
 
 def numbers_of_views(text: str) -> list[int]:
     """Parse whole numbers separated by commas. Raises ValueError for other text, or too few views to be parted."""
     counts = [int(part) for part in text.split(",")]
-    if min(counts) < FEWEST:
-        raise ValueError(f"{text!r}: expected {FEWEST} views or more, as both halves are reconstructed")
+    if min(counts) < FEWEST_VIEWS:
+        raise ValueError(f"{text!r}: expected {FEWEST_VIEWS} views or more, as both halves are reconstructed")
     return counts
 
 
@@ -53,7 +53,7 @@ def study_structure(
     from splatline_structure import pictures, results
     from splatline_structure.numbers import Rules, structure_of
     from splatline_structure.particles import NECK
-    from splatline_structure.volumes import Part, box_in
+    from splatline_structure.volumes import ReadSlices, box_in
 
     output = output or Path(f"{safe_name(scan.name.split('.')[0])}_views")
     values: dict[str, Any] = {
@@ -67,7 +67,9 @@ def study_structure(
         ).numbers
         asked = {name: [each for each in known if f"{each}_".startswith(f"{name}_")] for name in names}
         if unknown := [name for name, each in asked.items() if not each]:
-            raise click.UsageError(f"--number {unknown[0]}: expected one of {', '.join(known)}.")
+            raise click.UsageError(
+                f"--number {unknown[0]}: expected a kind, such as tortuosity, or one of {', '.join(known)}."
+            )
         names = tuple(dict.fromkeys(chain(*asked.values())))
         tell, series, axis_col, box = answer.counting("numbers of views"), {}, None, None
         for done, n in enumerate(sorted(views, reverse=True)):  # axis and box are those of the most views
@@ -77,9 +79,10 @@ def study_structure(
                 raise DataError(f"{scan} does not state the size of a pixel. Nothing was written.")
             axis_col = record.axis_col
             try:
-                box, n_slices = box or box_in(record.volume.data, True), record.grid.shape[0]
-                part = Part(record, slice(0, n_slices), slice(0, n_slices), n_slices)
-                series[n] = measured(scan, part, box, answer, **values).found.intervals
+                box = box or box_in(record.volume.data, True)
+                slices = slice(0, record.grid.shape[0])
+                read = ReadSlices(record, slices, slices, slices.stop)
+                series[n] = measured(scan, read, box, answer, **values).found.intervals
             except ValueError as error:
                 raise DataError(f"{n} views of {scan} cannot be measured: {error}. Nothing was written.") from error
         rows = [[str(n), *results.cells(name, series[n][name])] for n in views for name in names]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from beamline.api import Selection
 from beamline.core.errors import DataError
 from beamline.core.text import size
 from beamline.projections.prepare import prepare_projections
-from beamline.storage.readers.open import open_scan
+from beamline.storage.readers.open import open_scan, scan_format
 from beamline.storage.volumes.files import opened_volume
 from recon import Grid, Volume
 from recon.post import clusters
@@ -28,65 +27,74 @@ Box = tuple[slice, slice, slice]
 _BESIDE = 16  # slices beside those that are looked at, which the prior of a method takes in
 BYTES_OF_ALL, BYTES_OF_SQUARE, BYTES_BESIDE = 150, 75, 40 * 2 * _BESIDE
 """Peak memory a voxel of the slices that are looked at, with both halves, where the box is all of them (145 as measured
-where particles percolate, 105 of grains) or the square in a circle, at most 41 % of them; and a voxel of a slice, for
-those beside them, of which FISTA-TV makes halves."""
+where particles percolate, 105 of grains) or the square in a circle, at most 41 % of them; and a voxel of one slice, as
+FISTA-TV makes halves also of the `_BESIDE` slices on both sides, at 40 bytes a voxel."""
 _LEAST = 8  # voxels of a side
 _MARGIN = 0.05  # of the square in the sample's circle, at each end: the wall of a can stays out
 _GOES_ON = 0.5  # of the mean inside, at the rim of the field: there the sample is wider than the field
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
-    """Slices of a volume that are looked at.
+class ReadSlices:
+    """The slices of a volume that were read.
 
     Attributes:
         record: of these slices, lengths in mm.
-        slices: of the volume.
-        asked: those that were asked for: more, where memory holds no more.
-        count: all slices of the volume.
-        limit: the sentence on that; empty: all that were asked for are looked at.
+        slices: their numbers in the volume.
+        asked: slices that were asked for; `slices` are fewer where memory does not hold them all.
+        n_slices: of the whole volume.
+        limit_sentence: says that memory does not hold all that were asked for; empty where it does.
     """
 
     record: Any
     slices: slice
     asked: slice
-    count: int
-    limit: str = ""
+    n_slices: int
+    limit_sentence: str = ""
 
 
 def read_volume(
     path: Path, dataset: str | None, voxel_um: float | None, slices: tuple[int, int] | None, memory: int, crop: bool
-) -> Part:
+) -> ReadSlices:
     """The slices of a volume, or as many of them in the middle as fit the memory.
 
     Raises:
-        DataError: no volume of finite numbers, no size of a voxel, or more voxels than the memory takes.
+        DataError: no volume of finite numbers, no size of a voxel, no such slices, or one of which fewer than 8 slices,
+            or than were asked for, fit the memory.
     """
-    if dataset is None and path.is_file() and h5py.is_hdf5(path) and _is_scan(path):
-        raise DataError(f"{path} is a scan: reconstruct it with `beamline recon`. Nothing was written.")
+    if dataset is None and path.is_file() and h5py.is_hdf5(path) and (scan := scan_format(path)) is not None:
+        raise DataError(
+            f"{path} is a scan ({scan}): reconstruct it with `beamline recon`; if it is a volume, give --dataset. "
+            "Nothing was written."
+        )
     with opened_volume(path, dataset) as record:
         grid = record.volume.grid if voxel_um is None else Grid(record.volume.grid.shape, voxel_um * 1e-3)
         if voxel_um is None and record.length_unit != "mm":
             raise DataError(f"{path} does not state the size of a voxel: give --voxel-um. Nothing was written.")
-        first, end = slices or (0, grid.shape[0])
-        if not 0 <= first < end <= grid.shape[0]:
-            raise DataError(f"--slices {first} {end}: {path} has slices 0 to {grid.shape[0]}. Nothing was written.")
-        count, asked, each = grid.shape[0], slice(first, end), BYTES_OF_SQUARE if crop else BYTES_OF_ALL
-        most = (memory // math.prod(grid.shape[1:]) - BYTES_BESIDE) // each
+        n_slices = grid.shape[0]
+        first, end = slices or (0, n_slices)
+        if not 0 <= first < end <= n_slices:
+            raise DataError(f"--slices {first} {end}: {path} has slices 0 to {n_slices}. Nothing was written.")
+        bytes_a_voxel = BYTES_OF_SQUARE if crop else BYTES_OF_ALL
+        most = (memory // math.prod(grid.shape[1:]) - BYTES_BESIDE) // bytes_a_voxel
         if most < min(end - first, _LEAST):
             raise DataError(
                 f"{path}: {_LEAST} slices of {grid.shape[1]} x {grid.shape[2]} voxels take "
-                f"{size((each * _LEAST + BYTES_BESIDE) * math.prod(grid.shape[1:]))}, and {size(memory)} may be used. "
-                "Give more --memory, or a part of the volume (`recon --roi`). Nothing was written."
+                f"{size((bytes_a_voxel * _LEAST + BYTES_BESIDE) * math.prod(grid.shape[1:]))}, and {size(memory)} may "
+                "be used. Free memory, give more --memory, or measure a part of the volume (`recon --roi`). "
+                "Nothing was written."
             )
-        first, end = first + max(end - first - most, 0) // 2, end - max(end - first - most + 1, 0) // 2
-        limit = (
-            f"{size(memory)} of memory hold {end - first} of {asked.stop - asked.start} slices: numbers are of slices "
-            f"{first}:{end}, in the middle, and those named _all of {asked.start}:{asked.stop}, with intervals as wide "
-            "as in the middle."
-        )
-        grid = grid.part(slice(first, end), slice(0, grid.shape[1]), slice(0, grid.shape[2]))
-        values = np.ascontiguousarray(record.volume.data[first:end], np.float32)
+        excess = max(end - first - most, 0)
+        fitting = slice(first + excess // 2, end - (excess - excess // 2))
+        limit_sentence = ""
+        if excess:
+            limit_sentence = (
+                f"{size(memory)} of memory hold {most} of {end - first} slices: numbers are of slices "
+                f"{fitting.start}:{fitting.stop}, in the middle, and those named _all of {first}:{end}, with intervals "
+                "as wide as in the middle. Free memory or give more --memory to measure more slices."
+            )
+        grid = grid.part(fitting, slice(0, grid.shape[1]), slice(0, grid.shape[2]))
+        values = np.ascontiguousarray(record.volume.data[fitting], np.float32)
         if min(values.shape) < _LEAST:
             raise DataError(
                 f"{path} holds {values.shape}; expected {_LEAST} or more voxels a side. Nothing was written."
@@ -94,28 +102,29 @@ def read_volume(
         if not np.isfinite(values).all():
             raise DataError(f"{path} has values that are not finite. Nothing was written.")
         record = replace(record, volume=Volume(values, grid), length_unit="mm", deviation=None, series=None)
-        return Part(record, slice(first, end), asked, count, limit if slice(first, end) != asked else "")
+        return ReadSlices(record, fitting, slice(first, end), n_slices, limit_sentence)
 
 
-def slabs_of(path: Path, dataset: str | None, part: Part, box: Box) -> Iterator[F32]:
-    """The box in all slices that were asked for, at most as many at once as are looked at.
+def slabs_of(
+    path: Path, dataset: str | None, read: ReadSlices, box: Box, tell: Callable[[int, int], None]
+) -> Iterator[F32]:
+    """The box in all slices that were asked for, at most as many at once as were read.
+
+    Args:
+        tell: gets slabs taken, and all.
 
     Raises:
         DataError: values that are not finite.
     """
-    n, most = part.asked.stop - part.asked.start, part.slices.stop - part.slices.start
+    asked = np.arange(read.asked.start, read.asked.stop)
+    slabs = np.array_split(asked, math.ceil(asked.size / read.record.grid.shape[0]))
     with opened_volume(path, dataset) as record:
-        for at in np.array_split(np.arange(part.asked.start, part.asked.stop), math.ceil(n / most)):
+        for taken, at in enumerate(slabs, 1):
             slab = np.asarray(record.volume.data[at[0] : at[-1] + 1], np.float32)[:, *box[1:]]
             if not np.isfinite(slab).all():
                 raise DataError(f"{path} has values that are not finite. Nothing was written.")
             yield slab
-
-
-def _is_scan(path: Path) -> bool:
-    with suppress(DataError), open_scan(path):
-        return True
-    return False
+            tell(taken, len(slabs))
 
 
 def box_in(volume: F32, crop: bool) -> Box:
@@ -181,7 +190,7 @@ def inscribed_box(shape: tuple[int, int, int], circle: tuple[float, float, float
 
 
 def parts_of(
-    part: Part, scan: Path, count: int, warn: Callable[[str], None], tell: Callable[[int, int], None]
+    read: ReadSlices, scan: Path, count: int, warn: Callable[[str], None], tell: Callable[[int, int], None]
 ) -> list[F32]:
     """The slices of a volume from each of `count` interleaved parts of the views of its scan, by its method.
 
@@ -192,7 +201,7 @@ def parts_of(
         DataError, ConfigError: the scan cannot be read or prepared. ValueError: the method takes no such views, or the
             slices are not those of the scan's rows.
     """
-    record, facts, at = part.record, part.record.parameters, part.slices
+    record, facts, at = read.record, read.record.parameters, read.slices
     rows: Any = None if facts.get("rows", "all") == "all" else tuple(map(int, str(facts["rows"]).split(":")))
     selection = Selection(
         views=str(facts.get("views", "all")), rows=rows, binning=int(facts.get("binning", 1)), axis_col=record.axis_col,
@@ -201,13 +210,18 @@ def parts_of(
         selected = selection.of(source)
         first, end, side = selected.detector_rows.start, selected.detector_rows.stop, selected.binning
         if selected.cone is None:
-            if (end - first) // side != part.count:
-                raise ValueError(f"it has {part.count} slices, and rows {first} to {end} of its scan do not")
-            low, high = max(at.start - _BESIDE, 0), min(at.stop + _BESIDE, part.count)
+            if (end - first) // side != read.n_slices:
+                raise ValueError(
+                    f"the volume has {read.n_slices} slices, but rows {first}:{end} of its scan give "
+                    f"{(end - first) // side}: give --parts or --quick"
+                )
+            low, high = max(at.start - _BESIDE, 0), min(at.stop + _BESIDE, read.n_slices)
             selection = replace(selection, rows=(first + low * side, first + high * side))
             at = slice(at.start - low, at.stop - low)
-        elif part.limit:
-            raise ValueError("halves of a cone's views are reconstructed whole, which memory does not hold: --quick")
+        elif read.limit_sentence:
+            raise ValueError(
+                "halves of a cone's views are reconstructed whole, which memory does not hold: give --quick or --parts"
+            )
         prepared = prepare_projections(source, selection, warn)
     views, order = prepared.views, np.argsort(np.mod(prepared.geometry.angles, prepared.geometry.period), kind="stable")
     in_pixels = facts.get("pixel_pitch_unit") == "px"

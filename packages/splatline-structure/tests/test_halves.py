@@ -15,6 +15,7 @@ from grain_scenes import Scene
 
 import recon
 from beamline import api
+from beamline.core.errors import DataError
 from splatline_structure import pictures, volumes
 from splatline_structure.intervals import found_in
 from splatline_structure.volumes import box_in, parts_of, read_volume
@@ -119,10 +120,33 @@ def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
 ) -> None:
     monkeypatch.setattr(api, "reconstruct", None)
     result = beamline("study", "structure", "scan.h5", "--views", "16,64", "--number", "fraction_3")
-    assert (
-        result.exit_code == 2 and "--number fraction_3: expected one of fraction_1, fraction_2, surf" in result.stderr
-    )
+    words = "--number fraction_3: expected a kind, such as tortuosity, or one of fraction_1, fraction_2, surf"
+    assert result.exit_code == 2 and words in result.stderr
     assert "tortuosity_x." in result.stderr and left(here) == {"scan.h5"}
+
+
+def test_a_scan_is_refused_and_what_is_to_be_done_is_named(here: Path) -> None:
+    result = beamline("structure", "scan.h5", "--voxel-um", "2")
+    assert result.exit_code == 5
+    assert "is a scan (/exchange/data (Data Exchange)): reconstruct it with `beamline recon`" in result.stderr
+    assert left(here) == {"scan.h5"}
+
+
+def test_a_volume_that_is_laid_out_as_a_scan_is_read_by_its_name(here: Path) -> None:
+    with h5py.File(here / "volume.h5", "w") as file:
+        file["exchange/data"] = np.zeros((9, 10, 11), np.float32)
+    read = read_volume(here / "volume.h5", "exchange/data", 2, None, 10**9, True)
+    assert read.record.grid.shape == (9, 10, 11)
+    with pytest.raises(DataError, match="if it is a volume, give --dataset"):
+        read_volume(here / "volume.h5", None, 2, None, 10**9, True)
+
+
+def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(here: Path) -> None:
+    np.save(here / "v.npy", np.random.default_rng(0).random((10, 48, 48), np.float32))
+    read = read_volume(here / "v.npy", None, 2, None, 10**9, True)
+    read = replace(read, record=replace(read.record, parameters={"axis_col": 23.5}))
+    with pytest.raises(ValueError, match=r"has 10 slices, but rows 0:16 of its scan give 16: give --parts or --quick"):
+        parts_of(read, here / "scan.h5", 2, pytest.fail, lambda *_: None)
 
 
 @pytest.mark.parametrize(("views", "words"), [("8,64", "16 views or more"), ("many", "invalid literal")])

@@ -1,11 +1,22 @@
-"""Intervals of sizes, by the particles that are there."""
+"""Intervals of sizes, by the particles that are there; of all slices, by those of the middle; of a change."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from splatline_structure.intervals import SPLIT_OR_MERGED, Interval, _of_particles
+from splatline_structure.intervals import (
+    SPLIT_OR_MERGED,
+    Found,
+    Interval,
+    _of_particles,
+    difference,
+    found_in,
+    with_all_slices,
+)
+from splatline_structure.numbers import Rules
 from splatline_structure.particles import Particles
 
 
@@ -32,5 +43,55 @@ def test_other_numbers_and_a_field_without_whole_particles_have_none_of_it() -> 
 
 
 def test_words_name_no_cause_where_none_moves_a_number() -> None:
-    assert Interval(1, 0.999, 1, 0, views=0, levels=0, voxels=0, particles=0).words == "nothing moves this"
+    assert Interval(1, 0.999, 1, 0, views=0, levels=0, voxels=0, particles=0).words == (
+        "no cause changes this number; the interval is the narrowest that is given (0.1 % to a side)"
+    )
     assert Interval(1, 0.99, 1, 0, views=0, levels=0.01, voxels=0).words == "the threshold decides this, not the views"
+
+
+@pytest.fixture(scope="module")
+def found() -> Found:
+    """A plane of half of the voxels."""
+    volume = np.random.default_rng(0).normal(0, 0.02, (12, 20, 20)).astype(np.float32)
+    volume[:, 10:] += 1
+    return found_in(volume, [], 2, (1, 1, 1), Rules(2, 1, side=0))
+
+
+def slabs(share: float) -> list[np.ndarray]:
+    """Two unequal ones of 100 rows, of which this share is of the second material."""
+    slab = np.zeros((3, 100, 20), np.float32)
+    slab[:, round(100 * (1 - share)) :] = 1
+    return [slab, slab[:2]]
+
+
+@pytest.mark.parametrize(
+    ("share", "low", "high", "why_not"),
+    [
+        (0.5, 0.42, 0.58, ""),
+        (0.98, 0.9, 1.0, ""),  # its own end, where the middle's interval is 0.16 wide
+        (0.04, 0.0, 0.12, "the interval is 0 to 0.12, wider than half of the value"),
+    ],
+)
+def test_all_slices_have_the_half_width_of_the_middle_and_ends_of_their_own(
+    found: Found, share: float, low: float, high: float, why_not: str
+) -> None:
+    middle = Interval(0.1, 0.02, 0.18, views=0.0, levels=0.08, voxels=0.0, particles=0.0, why_not="0.02 to 0.18")
+    intervals = {**found.intervals, "fraction_2": middle}
+    of_all = with_all_slices(replace(found, intervals=intervals), slabs(share)).intervals["fraction_2_all"]
+    assert (of_all.value, of_all.low, of_all.high) == pytest.approx((share, low, high))
+    assert of_all.why_not == why_not
+
+
+def test_what_determines_nothing_of_the_middle_determines_nothing_of_all_slices(found: Found) -> None:
+    intervals = {name: Interval(0.5, why_not="no contrast") for name in found.intervals}
+    of_all = with_all_slices(replace(found, intervals=intervals), slabs(0.5)).intervals["fraction_2_all"]
+    assert of_all.why_not == "no contrast" and of_all.value == pytest.approx(0.5)
+
+
+def test_a_change_has_the_causes_of_both_states() -> None:
+    one = Interval(1, 0.96, 1.06, moves=0.01, views=0.04, levels=0.03, voxels=0, particles=0)
+    other = Interval(2, 1.97, 2.09, moves=0.03, views=0.03, levels=0.04, voxels=0.04, particles=0)
+    change = difference(one, other)
+    assert change.moves == pytest.approx(0.02)
+    assert (change.views, change.levels, change.voxels) == pytest.approx((0.05, 0.05, 0.04))
+    assert change.words == "more views would narrow this"

@@ -15,7 +15,7 @@ import tifffile
 from can_of_balls import BALLS, MATRIX, can
 from scipy import ndimage
 
-from splatline_structure import command, pictures
+from splatline_structure import command, pictures, volumes
 from tests.beamline.cli.small_scan import beamline, left
 
 VOXEL_UM = ("--voxel-um", "10")
@@ -114,6 +114,27 @@ def test_two_states_are_told_apart_or_not(here: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_of_two_states_both_boxes_are_given_and_numbers_of_all_slices_of_one_alone_are_warned_of(here: Path) -> None:
+    np.save(here / "short.npy", can()[12:28])
+    common = ("structure", "can.npy", "short.npy", *VOXEL_UM, "--quick", "--side", "0", "--compare")
+    result = beamline(*common, "--memory", "13.3M", "-o", "c")
+    assert result.exit_code == 0, result.output
+    assert "numbers named _all are not compared. Free memory, give more --memory, or give --slices" in result.stderr
+    rows = _rows(here / "c/numbers.csv")
+    slices = [[box.split(",")[0] for box in row["box"].split(" and ")] for row in rows]
+    assert slices == [["11:28", "0:16"]] * len(rows)
+    assert not any(row["number"].endswith("_all") for row in rows)
+
+
+def test_halves_are_cut_to_the_slices_that_are_measured_or_hold_these_alone(here: Path) -> None:
+    np.save(here / "middle.npy", can()[11:28])
+    read = volumes.read_volume(Path("can.npy"), None, 10, (11, 28), 10**9, True)
+    halves = command._parts(Path("can.npy"), read, None, quick=False, parts=(Path("can.npy"), Path("middle.npy")))
+    for half in halves:
+        np.testing.assert_array_equal(half, can()[11:28])
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_labels_are_a_tiff_of_bytes(here: Path) -> None:
     assert beamline("structure", "can.npy", *VOXEL_UM, "--quick", "--side", "0", "--labels", "tif").exit_code == 0
     labels = tifffile.imread(here / "can_structure/particles.tif")
@@ -200,7 +221,11 @@ REFUSED = [
     (("can.npy", *VOXEL_UM, "--particles", "3"), 2, "Material 3 of 2"),
     (("can.npy", *VOXEL_UM, "--compare"), 2, "--compare takes two volumes"),
     (("can.npy", "can.npy", *VOXEL_UM, "--parts", "can.npy", "can.npy"), 2, "--parts are of one volume"),
-    (("can.npy", *VOXEL_UM, "--parts", "small.npy", "small.npy"), 5, "a part of its views has"),
+    (
+        ("can.npy", *VOXEL_UM, "--parts", "small.npy", "small.npy"),
+        5,
+        "the volume from half of its views has the shape (4, 12, 12)",
+    ),
 ]
 
 

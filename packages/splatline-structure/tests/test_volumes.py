@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from can_of_balls import BALLS, CIRCLE, SHAPE, WALL, can, inside
 
 from splatline_structure.materials import materials_of
 from splatline_structure.numbers import Rules, structure_of
-from splatline_structure.volumes import box_in, inscribed_box, sample_circle
+from splatline_structure.volumes import box_in, inscribed_box, read_volume, sample_circle, slabs_of
 
 
 def test_the_circle_is_that_of_the_can() -> None:
@@ -32,6 +34,22 @@ def test_the_box_holds_nothing_of_a_cans_wall_and_all_of_a_wide_samples_field() 
     _, y, x = box_in(wide, True)
     assert y == x and y.stop - y.start == pytest.approx(80 * np.cos(np.pi / 4) * 0.9, abs=1)
     assert box_in(wide, False) == (slice(0, 10), slice(0, 80), slice(0, 80))
+
+
+@pytest.mark.parametrize(("slices", "read_slices"), [(None, slice(11, 28)), ((2, 40), slice(12, 29))])
+def test_slabs_of_a_volume_larger_than_the_memory_are_all_slices_and_are_counted(
+    tmp_path: Path, slices: tuple[int, int] | None, read_slices: slice
+) -> None:
+    path, counted = tmp_path / "can.npy", list[tuple[int, int]]()
+    np.save(path, can())
+    read = read_volume(path, None, 10, slices, 13_300_000, True)
+    first, end = slices or (0, 40)
+    assert (read.slices, read.asked, read.n_slices) == (read_slices, slice(first, end), 40)
+    assert "Free memory or give more --memory to measure more slices." in read.limit_sentence
+    box = box_in(read.record.volume.data, True)
+    slabs = list(slabs_of(path, None, read, box, lambda n, of: counted.append((n, of))))
+    np.testing.assert_array_equal(np.concatenate(slabs), can()[first:end, *box[1:]])
+    assert counted == [(1, 3), (2, 3), (3, 3)]
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.2])
