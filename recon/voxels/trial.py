@@ -55,8 +55,7 @@ def choose_weight(
 
     μ over the number of views follows the noise of a volume, which falls with the root of that number. So μ is √(8/7)
     times that of the trial. It is sought from FBP: a fit knows the views held out, and any weight takes it away from
-    them. The search begins an octave above the weight by the noise: it ends sooner on nine of 17 scans, with the same
-    weight, and later on two.
+    them.
 
     Args:
         start, sweeps: as of `NoiseBalance.of`.
@@ -68,7 +67,7 @@ def choose_weight(
             return [problem.prior.weight]
         balance = NoiseBalance.of(problem, start, sweeps)
         judge = (trial() if trial else Trial.of(problem)) if balance.first > 0 else None
-        best = None if judge is None else judge.best_weight(2 * balance.first)
+        best = None if judge is None else judge.best_weight(balance.first)
         return [balance.first, balance.noise] if best is None else [best.strength]
 
     first, *noise = problem.decide("weight", chosen)
