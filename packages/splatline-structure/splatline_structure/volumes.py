@@ -108,7 +108,7 @@ def read_volume(
 def slabs_of(
     path: Path, dataset: str | None, read: ReadSlices, box: Box, tell: Callable[[int, int], None]
 ) -> Iterator[F32]:
-    """The box in all slices that were asked for, at most as many at once as were read.
+    """The box in all slices that were asked for, at most as many at once as were read, and the last of the slab before.
 
     Args:
         tell: gets slabs taken, and all.
@@ -117,10 +117,13 @@ def slabs_of(
         DataError: values that are not finite.
     """
     asked = np.arange(read.asked.start, read.asked.stop)
-    slabs = np.array_split(asked, math.ceil(asked.size / read.record.grid.shape[0]))
+    slabs = [
+        slice(max(at[0] - 1, asked[0]), at[-1] + 1)
+        for at in np.array_split(asked, math.ceil(asked.size / read.record.grid.shape[0]))
+    ]
     with opened_volume(path, dataset) as record:
         for taken, at in enumerate(slabs, 1):
-            slab = np.asarray(record.volume.data[at[0] : at[-1] + 1], np.float32)[:, *box[1:]]
+            slab = np.asarray(record.volume.data[at], np.float32)[:, *box[1:]]
             if not np.isfinite(slab).all():
                 raise DataError(f"{path} has values that are not finite. Nothing was written.")
             yield slab
