@@ -69,7 +69,7 @@ class Seen:
 )
 @click.option(
     "--scan",
-    type=_FILE,
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="Scan of the volume, from whose halves it is made again. Default: the one that the volume names.",
 )
 @click.option("--quick", is_flag=True, help="Leave out what the views do to the numbers.")
@@ -77,7 +77,7 @@ class Seen:
               help="square: inside the circle of the sample, or of the field, without a can's wall.")  # fmt: skip
 @click.option("--memory", metavar="SIZE", callback=parsed(memory_size),
               help="For volumes, such as 8G. Of a larger one the slices in the middle that fit are looked at, and all "
-                   "for fractions and surface. Default: what is free.")  # fmt: skip
+                   "for fractions and surface; several volumes are measured whole. Default: what is free.")  # fmt: skip
 @click.option("--slices", type=click.IntRange(0), nargs=2, metavar="FIRST END", help="Slices to take. Default: all.")
 @click.option(
     "--radius",
@@ -119,7 +119,9 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
     Several volumes are a series in time. The new folder gets report.html, numbers.csv, structure.json, particles.csv
     and labels.
     """
+    from beamline.core.machine import free_memory
     from beamline.storage.interrupted import volume_file
+    from splatline_structure.volumes import read_volume
 
     if compare and len(volumes) != 2:
         raise click.UsageError(f"--compare takes two volumes, got {len(volumes)}.")
@@ -129,32 +131,34 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
     output = output or Path(f"{safe_name(paths[0].name.split('.')[0])}_structure")
     with answering(as_json) as answer:
         refuse_existing(output)
+        memory = free_memory() if values["memory"] is None else values["memory"]
+        reads = [
+            read_volume(
+                path, values["dataset"], values["voxel_um"], values["slices"], memory, values["crop"] == "square",
+                whole=len(paths) > 1,
+            )
+            for path in paths
+        ]  # fmt: skip
         seen = []
-        for path in paths:
+        for path, read in zip(paths, reads, strict=True):
             try:
-                seen.append(_seen(path, answer, **values))
+                seen.append(_seen(path, read, answer, **values))
             except ValueError as error:
                 raise DataError(f"{path} cannot be measured: {error}. Nothing was written.") from error
         _write(seen, compare, output, values, answer)
 
 
-def _seen(path: Path, answer: Answer, **values: Any) -> Seen:
+def _seen(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> Seen:
     """One volume, and what was found in it."""
-    from beamline.core.machine import free_memory
-    from splatline_structure.intervals import with_all_slices
-    from splatline_structure.volumes import box_in, read_volume, slabs_of
+    from splatline_structure import intervals, volumes
 
-    crop = values["crop"] == "square"
-    read = read_volume(
-        path, values["dataset"], values["voxel_um"], values["slices"], values["memory"] or free_memory(), crop
-    )
     if read.limit_sentence:
         answer.warn(f"{path}: {read.limit_sentence}")
-    seen = measured(path, read, box_in(read.record.volume.data, crop), answer, **values)
+    seen = measured(path, read, volumes.box_in(read.record.volume.data, values["crop"] == "square"), answer, **values)
     if not read.limit_sentence:
         return seen
-    slabs = slabs_of(path, values["dataset"], read, seen.box, answer.counting("slabs"))
-    return replace(seen, found=with_all_slices(seen.found, slabs))
+    slabs = volumes.slabs_of(path, values["dataset"], read, seen.box, answer.counting("slabs"))
+    return replace(seen, found=intervals.with_all_slices(seen.found, slabs))
 
 
 def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: Any) -> Seen:
@@ -180,12 +184,24 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
     grid, data, parts = read.record.grid.part(*box), read.record.volume.data, []
     for half in _parts(path, read, answer, **values):
         if half.shape != data.shape:
-            raise ValueError(f"the volume from half of its views has the shape {half.shape}, not {data.shape}")
+            raise ValueError(
+                f"the volume from half of its views has the shape {half.shape}, not {data.shape}: give --parts of "
+                "these voxels, or --quick"
+            )
         parts.append(np.ascontiguousarray(half[box]))
     rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
     dz, dy, dx = (1e3 * edge for edge in grid.spacing)
     volume = np.ascontiguousarray(data[box])
-    found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("structures"))
+    try:
+        found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("structures"))
+    except ValueError as error:
+        way_out = (
+            f"only slices {read.slices.start}:{read.slices.stop}, which memory holds, were looked at: give more "
+            "--memory, or others by --slices"
+            if read.limit_sentence
+            else "reconstruct from more views"
+        )
+        raise ValueError(f"{error}; {way_out}{', or give fewer --materials' if n_materials > 2 else ''}") from error
     return Seen(path, read, box, grid, volume, found)
 
 
@@ -200,10 +216,8 @@ def _parts(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> list[
         halves = []
         for half in values["parts"]:
             with opened_volume(half) as opened:
-                if opened.grid.shape[0] == read.n_slices:
-                    halves.append(opened.volume.data[read.slices])
-                else:  # it holds these slices alone
-                    halves.append(opened.volume.data[:])
+                holds_all = opened.grid.shape[0] == read.n_slices  # or these slices alone
+                halves.append(opened.volume.data[read.slices if holds_all else slice(None)])
         return halves
     scan = values["scan"] or Path(read.record.raw_file)
     if not scan.is_file():
@@ -221,8 +235,7 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
     """Write the folder, and say what is in it."""
     from beamline.core.events import json_of
     from beamline.report.html import Picture
-    from splatline_structure import pictures, results
-    from splatline_structure.intervals import difference
+    from splatline_structure import intervals, pictures, results
 
     first = seen[0]
     table = first.found.intervals
@@ -234,22 +247,19 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
         "command": " ".join(("beamline structure", *(str(each.path) for each in seen))),
     }
     states = [
-        results.facts_of(each.found, {**settings, "volume": each.path, "box": each.voxels(each.read.slices)})
+        results.facts_of(each.found, {
+            **settings, "volume": each.path, "box": each.voxels(each.read.slices),
+            "box_of_all": each.voxels(each.read.asked), "limit": each.read.limit_sentence,
+        })
         for each in seen
-    ]
+    ]  # fmt: skip
     if compare:
-        one, other = table, seen[1].found.intervals
-        table = {name: difference(each, other[name]) for name, each in one.items() if name in other}
-        if one.keys() != other.keys():
-            answer.warn(
-                "Memory holds all slices of only one of the two volumes: numbers named _all are not compared. Free "
-                "memory, give more --memory, or give --slices that it holds of both."
-            )
+        table = {name: intervals.difference(each, seen[1].found.intervals[name]) for name, each in table.items()}
     if len(seen) > 1:
         curves = {
             name: [each.found.intervals[name] for each in seen]
             for name, interval in first.found.intervals.items()
-            if not interval.why_not and all(name in each.found.intervals for each in seen)
+            if not interval.why_not
         }
         at = [float(each.read.record.parameters.get("time_s", k)) for k, each in enumerate(seen)]
         if curves:
@@ -260,13 +270,11 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
         f"{first.found.undecided:.1%} of the voxels are undecided; "
         f"{count(particles.label.size, 'particle')}, {int(particles.cut.sum())} cut by a face of the box."
     )
-    limits = [f"{each.path}: {each.read.limit_sentence}" for each in seen if each.read.limit_sentence]
-    in_table = seen if compare else [first]
-    box = " and ".join(each.voxels(each.read.slices) for each in in_table)
-    box_of_all = " and ".join(each.voxels(each.read.asked) for each in in_table)
+    limits = [f"{first.path}: {first.read.limit_sentence}"] if first.read.limit_sentence else []
+    box = " and ".join(each.voxels(each.read.slices) for each in (seen if compare else [first]))
     texts = {
         "report.html": results.page(title, undecided, limits, shown, table, settings),
-        "numbers.csv": results.numbers_table(table, box, box_of_all),
+        "numbers.csv": results.numbers_table(table, box, first.voxels(first.read.asked)),
         "structure.json": json_of(states[0] if len(seen) == 1 else {"states": states}),
         "particles.csv": results.particles_table(particles, first.grid),
     }

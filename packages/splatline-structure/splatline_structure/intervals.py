@@ -214,20 +214,26 @@ def with_all_slices(found: Found, slabs: Iterable[F32]) -> Found:
     """With fractions and surface of all slices, named `_all`, whose half-widths are those of the middle ones.
 
     Args:
-        slabs: all slices, some at a time.
+        slabs: all slices, some at a time; each but the first begins with the last slice of the one before, as surface
+            may lie between them.
     """
-    numbers, along = list[dict[str, float]](), list[F64]()
+    count, surfaces, shares, pairs = found.materials.levels.size, list[float](), list[F64](), list[int]()
     for slab in slabs:
         labels = labelled(slab, found.materials.thresholds)
-        numbers.append(shares_of(labels, found.materials.levels.size, found.spacing, found.rules))
-        along.append((labels == found.rules.particles - 1).mean(axis=(1, 2)))
-    intervals = dict(found.intervals)
-    for name in numbers[0]:
-        value = float(np.average([each[name] for each in numbers], weights=list(map(len, along))))
+        surfaces.append(shares_of(labels, count, found.spacing, found.rules)["surface"])
+        pairs.append(len(slab) - 1)
+        own = labels[1:] if shares else labels
+        shares.append(np.array([(own == k).mean(axis=(1, 2)) for k in range(count)]))
+    along, intervals = np.concatenate(shares, axis=1), dict(found.intervals)
+    numbers = {
+        **{f"fraction_{k}": float(share) for k, share in enumerate(along.mean(axis=1), 1)},
+        "surface": float(np.average(surfaces, weights=pairs)),
+    }
+    for name, value in numbers.items():
         of_all = replace(found.intervals[name], value=value)
         # Without ends nothing of the volume is determined, and why holds for all slices.
         intervals[f"{name}_all"] = of_all if math.isnan(of_all.low) else _judged(name.split("_")[0], of_all)
-    return replace(found, intervals=intervals, along_all=np.concatenate(along))
+    return replace(found, intervals=intervals, along_all=along[found.rules.particles - 1])
 
 
 def difference(one: Interval, other: Interval) -> Interval:

@@ -77,7 +77,7 @@ def materials_of(volume: F32, count: int, seed: int = 0) -> Materials:
         raise ValueError(
             f"no contrast: materials {worst + 1} and {worst + 2} of {count} have the levels {levels[worst]:.4g} and "
             f"{levels[worst + 1]:.4g}, and {valleys[worst]:.2g} times as many voxels lie half-way between them as near "
-            "the rarer one; give fewer --materials, or reconstruct from more views"
+            "the rarer one"
         )
     return Materials(levels, spread, spread * np.array([math.sqrt(8 / core.size) for core in cores]))
 
@@ -89,7 +89,7 @@ def _core(volume: F32, mask: Mask, k: int, count: int) -> F32:
         return core
     values = volume[mask]
     if not values.size:
-        raise ValueError(f"fewer than {count} materials: no voxel is of material {k + 1}; give fewer --materials")
+        raise ValueError(f"fewer than {count} materials: no voxel is of material {k + 1}")
     low, high = (0, 25) if k == 0 else (75, 100) if k == count - 1 else (37.5, 62.5)
     low, high = np.percentile(values, (low, high))
     return values[(values >= low) & (values <= high)]

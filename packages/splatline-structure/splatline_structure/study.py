@@ -18,10 +18,13 @@ from splatline_structure.command import FEWEST_VIEWS, measured
 
 def numbers_of_views(text: str) -> list[int]:
     """Parse whole numbers separated by commas. Raises ValueError for other text, or too few views to be parted."""
-    counts = [int(part) for part in text.split(",")]
-    if min(counts) < FEWEST_VIEWS:
-        raise ValueError(f"{text!r}: expected {FEWEST_VIEWS} views or more, as both halves are reconstructed")
-    return counts
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() and int(part) >= FEWEST_VIEWS for part in parts):
+        raise ValueError(
+            f"{text!r}: expected numbers such as 45,90,180, of {FEWEST_VIEWS} views or more, as both halves are "
+            "reconstructed"
+        )
+    return list(dict.fromkeys(map(int, parts)))
 
 
 @click.command("study structure")

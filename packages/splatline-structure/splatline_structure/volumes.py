@@ -15,7 +15,7 @@ from scipy import ndimage
 import recon
 from beamline.api import Selection
 from beamline.core.errors import DataError
-from beamline.core.text import size
+from beamline.core.text import rounded, size
 from beamline.projections.prepare import prepare_projections
 from beamline.storage.readers.open import open_scan, scan_format
 from beamline.storage.volumes.files import opened_volume
@@ -54,13 +54,22 @@ class ReadSlices:
 
 
 def read_volume(
-    path: Path, dataset: str | None, voxel_um: float | None, slices: tuple[int, int] | None, memory: int, crop: bool
+    path: Path,
+    dataset: str | None,
+    voxel_um: float | None,
+    slices: tuple[int, int] | None,
+    memory: int,
+    crop: bool,
+    whole: bool = False,
 ) -> ReadSlices:
     """The slices of a volume, or as many of them in the middle as fit the memory.
 
+    Args:
+        whole: all slices that are asked for, or none.
+
     Raises:
         DataError: no volume of finite numbers, no size of a voxel, no such slices, or one of which fewer than 8 slices,
-            or than were asked for, fit the memory.
+            or than were asked for, fit the memory; by `whole` fewer than all that were asked for.
     """
     if dataset is None and path.is_file() and h5py.is_hdf5(path) and (scan := scan_format(path)) is not None:
         raise DataError(
@@ -77,22 +86,24 @@ def read_volume(
             raise DataError(f"--slices {first} {end}: {path} has slices 0 to {n_slices}. Nothing was written.")
         bytes_a_voxel = BYTES_OF_SQUARE if crop else BYTES_OF_ALL
         most = (memory // math.prod(grid.shape[1:]) - BYTES_BESIDE) // bytes_a_voxel
-        if most < min(end - first, _LEAST):
+        least = end - first if whole else min(end - first, _LEAST)
+        if most < least:
+            needed = rounded((bytes_a_voxel * least + BYTES_BESIDE) * math.prod(grid.shape[1:]), up=True)
             raise DataError(
-                f"{path}: {_LEAST} slices of {grid.shape[1]} x {grid.shape[2]} voxels take "
-                f"{size((bytes_a_voxel * _LEAST + BYTES_BESIDE) * math.prod(grid.shape[1:]))}, and {size(memory)} may "
-                "be used. Free memory, give more --memory, or measure a part of the volume (`recon --roi`). "
-                "Nothing was written."
+                f"{path}: {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels take {size(needed)}, and "
+                f"{size(memory)} may be used{' for each of several volumes' if whole else ''}. Free memory, give more "
+                f"--memory{', fewer --slices' if whole else ''}{'' if crop else ', --crop square'}, or measure a part "
+                "of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
             )
         excess = max(end - first - most, 0)
         fitting = slice(first + excess // 2, end - (excess - excess // 2))
-        limit_sentence = ""
-        if excess:
-            limit_sentence = (
-                f"{size(memory)} of memory hold {most} of {end - first} slices: numbers are of slices "
-                f"{fitting.start}:{fitting.stop}, in the middle, and those named _all of {first}:{end}, with intervals "
-                "as wide as in the middle. Free memory or give more --memory to measure more slices."
-            )
+        limit_sentence = (
+            f"{size(memory)} of memory hold {most} of {end - first} slices: numbers are of slices "
+            f"{fitting.start}:{fitting.stop}, in the middle, and those named _all of {first}:{end}, with intervals "
+            "as wide as in the middle. Free memory or give more --memory to measure more slices."
+            if excess
+            else ""
+        )
         grid = grid.part(fitting, slice(0, grid.shape[1]), slice(0, grid.shape[2]))
         values = np.ascontiguousarray(record.volume.data[fitting], np.float32)
         if min(values.shape) < _LEAST:
@@ -108,7 +119,7 @@ def read_volume(
 def slabs_of(
     path: Path, dataset: str | None, read: ReadSlices, box: Box, tell: Callable[[int, int], None]
 ) -> Iterator[F32]:
-    """The box in all slices that were asked for, at most as many at once as were read.
+    """The box in all slices that were asked for, at most as many at once as were read, and the last of the slab before.
 
     Args:
         tell: gets slabs taken, and all.
@@ -117,10 +128,13 @@ def slabs_of(
         DataError: values that are not finite.
     """
     asked = np.arange(read.asked.start, read.asked.stop)
-    slabs = np.array_split(asked, math.ceil(asked.size / read.record.grid.shape[0]))
+    slabs = [
+        slice(max(at[0] - 1, asked[0]), at[-1] + 1)
+        for at in np.array_split(asked, math.ceil(asked.size / read.record.grid.shape[0]))
+    ]
     with opened_volume(path, dataset) as record:
         for taken, at in enumerate(slabs, 1):
-            slab = np.asarray(record.volume.data[at[0] : at[-1] + 1], np.float32)[:, *box[1:]]
+            slab = np.asarray(record.volume.data[at], np.float32)[:, *box[1:]]
             if not np.isfinite(slab).all():
                 raise DataError(f"{path} has values that are not finite. Nothing was written.")
             yield slab
@@ -198,10 +212,12 @@ def parts_of(
     Of a parallel beam the rows of these slices, and some beside them, are read.
 
     Raises:
-        DataError, ConfigError: the scan cannot be read or prepared. ValueError: the method takes no such views, or the
-            slices are not those of the scan's rows.
+        DataError, ConfigError: the scan cannot be read or prepared. ValueError: the method takes no such views, the
+            slices are not those of the scan's rows, or the volume does not state its axis.
     """
     record, facts, at = read.record, read.record.parameters, read.slices
+    if math.isnan(record.axis_col):
+        raise ValueError("it does not state the axis of its scan, about which halves are made: give --parts or --quick")
     rows: Any = None if facts.get("rows", "all") == "all" else tuple(map(int, str(facts["rows"]).split(":")))
     selection = Selection(
         views=str(facts.get("views", "all")), rows=rows, binning=int(facts.get("binning", 1)), axis_col=record.axis_col,

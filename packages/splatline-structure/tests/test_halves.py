@@ -18,6 +18,7 @@ from beamline import api
 from beamline.core.errors import DataError
 from splatline_structure import pictures, volumes
 from splatline_structure.intervals import found_in
+from splatline_structure.study import numbers_of_views
 from splatline_structure.volumes import box_in, parts_of, read_volume
 from tests.beamline.cli.small_scan import beamline, left
 
@@ -149,8 +150,23 @@ def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(her
         parts_of(read, here / "scan.h5", 2, pytest.fail, lambda *_: None)
 
 
-@pytest.mark.parametrize(("views", "words"), [("8,64", "16 views or more"), ("many", "invalid literal")])
-def test_views_that_cannot_be_parted_are_refused(here: Path, views: str, words: str) -> None:
+def test_halves_of_a_volume_without_an_axis_are_refused_with_a_way_out(here: Path) -> None:
+    np.save(here / "v.npy", np.random.default_rng(0).random((16, 48, 48), np.float32))
+    result = beamline("structure", "v.npy", "--voxel-um", "2", "--scan", "scan.h5")
+    words = (
+        "v.npy cannot be measured: it does not state the axis of its scan, about which halves are made: give --parts"
+    )
+    assert result.exit_code == 5 and words in result.stderr
+    assert left(here) == {"scan.h5", "v.npy"}
+
+
+@pytest.mark.parametrize("views", ["8,64", "many", "16,", "1e3"])
+def test_views_that_cannot_be_parted_are_refused(here: Path, views: str) -> None:
     result = beamline("study", "structure", "scan.h5", "--views", views)
-    assert result.exit_code == 2 and words in result.stderr
+    assert result.exit_code == 2
+    assert f"'{views}': expected numbers such as 45,90,180, of 16 views or more" in result.stderr
     assert left(here) == {"scan.h5"}
+
+
+def test_the_same_number_of_views_counts_once() -> None:
+    assert numbers_of_views("64, 16,64") == [64, 16]

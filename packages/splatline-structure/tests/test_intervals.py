@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from splatline_structure.intervals import (
     SPLIT_OR_MERGED,
@@ -16,7 +17,7 @@ from splatline_structure.intervals import (
     found_in,
     with_all_slices,
 )
-from splatline_structure.numbers import Rules
+from splatline_structure.numbers import Rules, shares_of
 from splatline_structure.particles import Particles
 
 
@@ -58,7 +59,7 @@ def found() -> Found:
 
 
 def slabs(share: float) -> list[np.ndarray]:
-    """Two unequal ones of 100 rows, of which this share is of the second material."""
+    """Two unequal ones of 100 rows, of which this share is of the second material; one slice is in both."""
     slab = np.zeros((3, 100, 20), np.float32)
     slab[:, round(100 * (1 - share)) :] = 1
     return [slab, slab[:2]]
@@ -86,6 +87,30 @@ def test_what_determines_nothing_of_the_middle_determines_nothing_of_all_slices(
     intervals = {name: Interval(0.5, why_not="no contrast") for name in found.intervals}
     of_all = with_all_slices(replace(found, intervals=intervals), slabs(0.5)).intervals["fraction_2_all"]
     assert of_all.why_not == "no contrast" and of_all.value == pytest.approx(0.5)
+
+
+def layers() -> np.ndarray:
+    """Parallel to the slices, 8 of them thick."""
+    return np.broadcast_to(np.arange(96)[:, None, None] // 8 % 2, (96, 20, 20)).astype(np.float32)
+
+
+def blobs() -> np.ndarray:
+    return (ndimage.gaussian_filter(np.random.default_rng(1).normal(size=(60, 40, 40)), 2) > 0).astype(np.float32)
+
+
+@pytest.mark.parametrize(("volume", "off"), [(layers(), 1e-12), (blobs(), 2e-3)])
+@pytest.mark.parametrize("n", [2, 5, 12])
+def test_fractions_and_surface_of_all_slices_are_those_of_the_whole(
+    found: Found, volume: np.ndarray, off: float, n: int
+) -> None:
+    """Also where all surface lies between two slabs. Crossings within their common slices count in both of them."""
+    whole = shares_of(volume.astype(np.uint8), 2, found.spacing, found.rules)
+    parts = [volume[max(at[0] - 1, 0) : at[-1] + 1] for at in np.array_split(np.arange(len(volume)), n)]
+    of_all = with_all_slices(found, parts)
+    for name in ("fraction_1", "fraction_2"):
+        assert of_all.intervals[f"{name}_all"].value == pytest.approx(whole[name])
+    assert of_all.intervals["surface_all"].value == pytest.approx(whole["surface"], rel=off)
+    assert of_all.along_all == pytest.approx(volume.mean(axis=(1, 2)))
 
 
 def test_a_change_has_the_causes_of_both_states() -> None:

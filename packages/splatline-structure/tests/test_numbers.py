@@ -11,7 +11,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes, mesh_surface_area, regionprops
 
 from splatline_structure.materials import labelled, materials_of, probabilities
-from splatline_structure.numbers import Rules, coarse, shares_of, structure_of
+from splatline_structure.numbers import Rules, coarse, structure_of
 from splatline_structure.particles import cleaned, measured, parted, surfaces
 from splatline_structure.transport import connecting, tortuosity
 
@@ -68,15 +68,6 @@ def test_fraction_volumes_and_places_are_those_of_other_libraries() -> None:
     assert numbers["fraction_1"] == pytest.approx(porespy.metrics.porosity(~mask), rel=1e-6)
     through = porespy.filters.trim_nonpercolating_paths(mask, inlets=faces(0), outlets=faces(-1))
     assert numbers["connected_z"] == pytest.approx(through.sum() / mask.sum(), rel=0.01)
-
-
-def test_slabs_add_up_to_the_whole() -> None:
-    labels, rules = blobs().astype(np.uint8), Rules(2, 1)
-    whole = shares_of(labels, 2, (1, 1, 1), rules)
-    slabs = [shares_of(slab, 2, (1, 1, 1), rules) for slab in np.split(labels, 3)]
-    for name in ("fraction_1", "fraction_2"):
-        assert np.mean([each[name] for each in slabs]) == pytest.approx(whole[name])
-    assert np.mean([each["surface"] for each in slabs]) == pytest.approx(whole["surface"], rel=0.01)
 
 
 def faces(at: int) -> NDArray[np.bool_]:

@@ -114,16 +114,54 @@ def test_two_states_are_told_apart_or_not(here: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_of_two_states_both_boxes_are_given_and_numbers_of_all_slices_of_one_alone_are_warned_of(here: Path) -> None:
+def test_of_two_states_both_boxes_are_given(here: Path) -> None:
     np.save(here / "short.npy", can()[12:28])
     common = ("structure", "can.npy", "short.npy", *VOXEL_UM, "--quick", "--side", "0", "--compare")
-    result = beamline(*common, "--memory", "13.3M", "-o", "c")
+    result = beamline(*common, "-o", "c")
     assert result.exit_code == 0, result.output
-    assert "numbers named _all are not compared. Free memory, give more --memory, or give --slices" in result.stderr
     rows = _rows(here / "c/numbers.csv")
     slices = [[box.split(",")[0] for box in row["box"].split(" and ")] for row in rows]
-    assert slices == [["11:28", "0:16"]] * len(rows)
-    assert not any(row["number"].endswith("_all") for row in rows)
+    assert slices == [["0:40", "0:16"]] * len(rows)
+
+
+@pytest.mark.parametrize("options", [("--compare",), ()])
+def test_several_volumes_of_which_memory_does_not_hold_one_are_refused_before_any_is_measured(
+    here: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
+) -> None:
+    """Else other slices of the one would be compared with those of the other."""
+    np.save(here / "short.npy", can()[12:28])
+    before = left(here)
+    monkeypatch.setattr(command, "measured", None)
+    result = beamline("structure", "short.npy", "can.npy", *VOXEL_UM, *options, "--memory", "13.3M")
+    assert result.exit_code == 5
+    assert (
+        "can.npy: 40 slices of 72 x 72 voxels take 22.2 MB, and 13.3 MB may be used for each of several volumes. "
+        "Free memory, give more --memory, fewer --slices, or measure a part" in result.stderr
+    )
+    result = beamline("structure", "can.npy", "can.npy", *VOXEL_UM, *options, "--memory", "13.3M", "--crop", "none")
+    assert "fewer --slices, --crop square, or" in result.stderr and left(here) == before
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_several_volumes_are_measured_in_the_memory_that_is_free_at_the_beginning(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = iter([10**9])
+    monkeypatch.setattr("beamline.core.machine.free_memory", lambda: next(free))
+    result = beamline("structure", "can.npy", "can.npy", *VOXEL_UM, "--quick", "--side", "0")
+    assert result.exit_code == 0, result.output
+
+
+def test_without_contrast_in_the_middle_these_slices_are_named(here: Path) -> None:
+    volume = can()
+    volume[10:30] = np.random.default_rng(0).normal(1, 0.1, volume[10:30].shape)
+    np.save(here / "can.npy", volume)
+    common = ("structure", "can.npy", *VOXEL_UM, "--quick", "--crop", "none", "--memory", "16M")
+    result = beamline(*common)
+    words = "the rarer one; only slices 14:26, which memory holds, were looked at: give more --memory, or others by"
+    assert result.exit_code == 5 and words in result.stderr
+    assert "views" not in result.stderr and "--materials" not in result.stderr
+    assert "--slices, or give fewer --materials. Nothing" in beamline(*common, "--materials", "3").stderr
 
 
 def test_halves_are_cut_to_the_slices_that_are_measured_or_hold_these_alone(here: Path) -> None:
@@ -171,6 +209,7 @@ def test_of_a_volume_larger_than_the_memory_the_middle_is_looked_at_and_all_for_
     y, x = (slice(*map(int, part.split(":"))) for part in facts["box"].split(",")[1:])
     dense = volume[:, y, x] > np.mean(facts["levels"])
     numbers = facts["numbers"]
+    assert words in facts["limit"] and facts["box"][:6] == "11:28," and facts["box_of_all"][:5] == "0:40,"
     assert numbers["fraction_2"]["value"] == pytest.approx(dense[11:28].mean())
     assert numbers["fraction_2_all"]["value"] == pytest.approx(dense.mean())
     for name in ("fraction_1", "fraction_2", "surface"):
@@ -211,20 +250,23 @@ print(peaks[1] - peaks[0])
 
 REFUSED = [
     (("even.npy", *VOXEL_UM), 5, "even.npy cannot be measured"),
-    (("noise.npy", *VOXEL_UM), 5, "no contrast: materials 1 and 2 of 2"),
+    (("noise.npy", *VOXEL_UM), 5, "near the rarer one; reconstruct from more views. Nothing"),
     (("can.npy",), 5, "does not state the size of a voxel: give --voxel-um"),
     (("holes.npy", *VOXEL_UM), 5, "values that are not finite"),
     (("small.npy", *VOXEL_UM), 5, "expected 8 or more voxels a side"),
     (("can.npy", *VOXEL_UM, "--slices", "3", "99"), 5, "has slices 0 to 40"),
     (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "8 slices of 72 x 72 voxels take 9.75 MB, and 4 MB may be used"),
     (("can.npy", *VOXEL_UM, "--memory", "some"), 2, "'some' is not a size"),
+    (("can.npy", *VOXEL_UM, "--memory", "0.0001K"), 5, "and 0 B may be used"),
+    (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "(`recon --roi`, then --parts or --quick)"),
+    (("can.npy", *VOXEL_UM, "--scan", "nosuch.h5"), 2, "'nosuch.h5' does not exist"),
     (("can.npy", *VOXEL_UM, "--particles", "3"), 2, "Material 3 of 2"),
     (("can.npy", *VOXEL_UM, "--compare"), 2, "--compare takes two volumes"),
     (("can.npy", "can.npy", *VOXEL_UM, "--parts", "can.npy", "can.npy"), 2, "--parts are of one volume"),
     (
         ("can.npy", *VOXEL_UM, "--parts", "small.npy", "small.npy"),
         5,
-        "the volume from half of its views has the shape (4, 12, 12)",
+        "half of its views has the shape (4, 12, 12), not (40, 72, 72): give --parts of these voxels, or --quick",
     ),
 ]
 
