@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -96,12 +95,7 @@ def _present_name(path: KeyPath) -> KeyPath:
 
 
 def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
-    """The values in a YAML text, and the place of each, as copies that the caller may change."""
-    return deepcopy(_parsed_once(text, name))
-
-
-@lru_cache(maxsize=64)  # the template, and the files of some scans: to parse one takes 30 ms
-def _parsed_once(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
+    """The values in a YAML text, and the place of each."""
     origins: dict[KeyPath, str] = {}
     with yaml_faults(text, name):
         node = yaml.compose(text, _Loader)

@@ -107,9 +107,9 @@ def live_should_end(stop: StopRequest, useless: bool) -> Callable[[], bool]:
     return lambda: useless or (stop.stopping and stop.seconds >= last)
 
 
-def aborting_else_told(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], bool]:
-    """Whether a scan that has ended was aborted, so that its live reconstruction should be killed. Each answer may tell
-    how long a stopped scan has waited for the volume since its stop: the first one, then every 5 s."""
+def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], bool]:
+    """A question for the wait for the live volume of a scan that has ended: was the scan aborted? Then the live
+    reconstruction is killed. Of a stopped scan it says when first asked, then every 5 s, how long that has waited."""
     asked_at = max(stop.seconds, ASK_LIVE_AFTER) if stop.stopping else 0.0  # for the volume, see `live_should_end`
     due, most = 0.0, asked_at + _GRACE
 

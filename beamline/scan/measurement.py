@@ -28,7 +28,7 @@ from beamline.scan.control import State, StateMachine
 from beamline.scan.decider import Decider
 from beamline.scan.flagged import AlarmReaction, FlaggedFrames
 from beamline.scan.ledger import LedgerError
-from beamline.scan.live_process import LiveReconstruction, aborting_else_told, live_should_end
+from beamline.scan.live_process import LiveReconstruction, abort_watch, live_should_end
 from beamline.scan.moves import SAFE, UNSAFE, WRITTEN
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.recorder import Recorder
@@ -199,7 +199,7 @@ class Measurement:
         self.sink(ScanDone(result))
         if follower is not None:
             useless = not closed or isinstance(ended.error, ReferencesError)
-            aborting = aborting_else_told(self.stop, lambda text: self.sink(StateEntered(self.states.state, text)))
+            aborting = abort_watch(self.stop, lambda text: self.sink(StateEntered(self.states.state, text)))
             recon = follower.finish(live_should_end(self.stop, useless), aborting)
             result = replace(result, recon=recon)
         if ended.error is not None:

@@ -135,13 +135,13 @@ def record_scan(
     """
     began = time.monotonic()
     others = ConnectedDevices(cast(Devices, None), SystemClock(), None, lambda: None)  # whose devices nobody asks for
-    command = follow_command(config, live_plan(ready.timing.shape, ready.plan.angles.size, free_memory()))
     with ExitStack() as stack:
         folder = create_run_folder(runs, config.sample.name, others.clock.now())
         sink = _announcing(config, ready, folder, others.clock, sinks, stack)
         measurement = Measurement(config, others, ready, folder, stop, sink, began, None, source_of)
         stack.enter_context(verbs_taken(folder, stop, measurement.pause))
-        return _to_its_end(measurement, command if live else None, None, lambda: None)
+        views = live_plan(ready.timing.shape, ready.plan.angles.size, free_memory())
+        return _to_its_end(measurement, follow_command(config, views) if live else None, None, lambda: None)
 
 
 def _announcing(

@@ -7,7 +7,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-import scipy
+import scipy  # whose ndimage loads at its first use: every scan imports this module
 from numpy.typing import NDArray
 
 from recon.base.arrays import F32, median_deviation, some_values

@@ -32,7 +32,6 @@ depth of a tooth's thin cracks. Simulated cathodes that gain 4 to 11 dB have 14 
 afterwards 13.5 and 13.9 %."""
 _FIRST, _LONGEST = 1.0, 64.0  # squares of lengths, in pixels: where the search begins, and the largest
 _ERRORS = 3.0  # standard errors by which a filter must predict better than none
-_SOUGHT_CLOSER = 0.9  # of `LEAST_DROP`, by whole octaves: half octaves gained up to a sixteenth more, of 36 scans
 _VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a trial by `FistaTv`
 
 
@@ -109,8 +108,8 @@ class FilterLength:
     """The filter's length that predicts views held out best.
 
     Attributes:
-        length: in pixels; within a fifth where the gain is below nine tenths of `LEAST_DROP`.
-        factor: one standard error of its square, as a ratio, by how views held out disagree; inf: not determined.
+        length: in pixels.
+        factor: one standard error of its square, as a ratio, by how views held out disagree.
         gain: relative decrease of the residual of these views, against no filter.
     """
 
@@ -162,14 +161,9 @@ def length_by_held_out_views(
     best = preferred_strength(residuals_of, _FIRST)
     if best is None or best.strength > _LONGEST:
         return None
-    none = residuals_of(0.0)
-    gain = 1 - float(best.residuals.mean() / none.mean())
-    if gain < _SOUGHT_CLOSER * LEAST_DROP:
-        certain = exceeds_standard_error(none - best.residuals, _ERRORS)
-        return FilterLength(math.sqrt(best.strength), math.inf, gain) if certain else None
     near = (_FIRST * 2.0 ** (round(math.log2(best.strength / _FIRST)) + half) for half in (-0.5, 0.0, 0.5))
     at = min(near, key=lambda square: float(residuals_of(square).mean()))
-    least = residuals_of(at)
+    least, none = residuals_of(at), residuals_of(0.0)
     if not exceeds_standard_error(none - least, _ERRORS):
         return None
     weaker, stronger = (residuals_of(at * 2.0**half) - least for half in (-0.5, 0.5))

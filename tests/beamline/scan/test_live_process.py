@@ -260,7 +260,7 @@ def test_how_long_the_volume_of_a_stopped_scan_is_waited_for_is_said_at_once_and
     if ended_after is not None:
         stop.stop()
         seconds += ended_after
-    aborting = live_process.aborting_else_told(stop, told.append)
+    aborting = live_process.abort_watch(stop, told.append)
     if ended_after is None:
         assert not aborting() and not told
         stop.stop()
