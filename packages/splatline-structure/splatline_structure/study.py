@@ -79,7 +79,10 @@ def study_structure(
             tell(done, len(views))
             record = reconstruct(scan, method, views=f"fixed:{n}", selection=Selection(axis_col=axis_col), say=None)
             if record.length_unit != "mm":
-                raise DataError(f"{scan} does not state the size of a pixel. Nothing was written.")
+                raise DataError(
+                    f"{scan} does not state the size of a pixel: `beamline ingest {scan} COPY.h5 --pixel-size-um SIZE` "
+                    "makes a copy that does. Nothing was written."
+                )
             axis_col = record.axis_col
             try:
                 box = box or box_in(record.volume.data, True)

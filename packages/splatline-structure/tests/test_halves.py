@@ -116,6 +116,18 @@ def test_intervals_against_views_are_wider_for_fewer_in_one_box_about_one_axis(
     assert len(boxes) == 1 and axes[0] is None and axes[1] == pytest.approx(23.5, abs=0.2)
 
 
+@pytest.mark.slow
+def test_a_scan_without_the_size_of_a_pixel_is_copied_with_one_and_studied(here: Path) -> None:
+    with h5py.File("scan.h5", "a") as file:
+        del file.attrs["pixel_size_mm"]
+    result = beamline("study", "structure", "scan.h5", "--views", "64", "--number", "surface", "-m", "fbp")
+    assert result.exit_code == 5 and "`beamline ingest scan.h5 COPY.h5 --pixel-size-um SIZE`" in result.stderr
+    assert left(here) == {"scan.h5"}
+    assert beamline("ingest", "scan.h5", "copy.h5", "--pixel-size-um", "2").exit_code == 0
+    result = beamline("study", "structure", "copy.h5", "--views", "64", "--number", "surface", "-m", "fbp")
+    assert result.exit_code == 0, result.output
+
+
 def test_a_number_that_is_not_there_is_refused_before_anything_is_reconstructed(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
