@@ -23,7 +23,7 @@ from beamline.plan.plan import ScanPlan
 from beamline.scan.preflight import ReadyScan
 from beamline.scan.runs import end_record
 from beamline.storage import datasets, hdf5
-from beamline.storage.interrupted import n_still_to_take, offset_taken, still_to_take
+from beamline.storage.interrupted import is_ride, n_still_to_take, offset_taken, still_to_take
 from beamline.storage.parts import (
     end_references_missing,
     files_with_frames,
@@ -180,7 +180,7 @@ def _alone(run: Path) -> Iterator[WriterLock]:
 
 
 def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
-    if "\nride:" in (run / CONFIG).read_text(encoding="utf-8", errors="replace"):
+    if is_ride(run):
         raise ConfigError(
             f"{run} is a ride on the scan of another program, which cannot be continued here: `beamline ride` records "
             f"the next one in a new run. {_UNTOUCHED}"

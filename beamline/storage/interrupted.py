@@ -121,14 +121,21 @@ def _step_of_run(run: Path) -> str:
         )
     if not files_with_frames(run):
         return "It ended before its first frame: start the scan anew."
-    resume = f"`beamline scan --resume {run}` takes what is missing"
+    ride, resume = is_ride(run), f"`beamline scan --resume {run}` takes what is missing"
     if growing:
-        return f"{_died(lives is False or abandoned(scan))}: {resume}, `beamline recover {run}` {_MAKES}."
+        resume = "" if ride else f"{resume}, "
+        return f"{_died(lives is False or abandoned(scan))}: {resume}`beamline recover {run}` {_MAKES}."
     if head is not None and _lacks_views(run):
-        return f"It ended early: {resume}."
+        return "It ended early, as a ride, which cannot be continued." if ride else f"It ended early: {resume}."
     record = read_record(parts[-1])
     died = record is not None and record.state == DIED
     return f"Its process died after its scan file was closed: `beamline recover {run}` ends the run." if died else ""
+
+
+def is_ride(run: Path) -> bool:
+    """Whether a run recorded the scan of another program, which alone can take more of it."""
+    config = run / CONFIG
+    return config.is_file() and "\nride:" in config.read_text(encoding="utf-8", errors="replace")
 
 
 _MAKES = "makes an ordinary file of the frames that are there"

@@ -97,6 +97,16 @@ def test_a_scan_that_ended_early_can_be_resumed_until_nothing_is_missing(tmp_pat
     assert "--resume" not in beamline("validate", run / "scan.h5").output
 
 
+def test_nobody_is_told_to_continue_a_ride(tmp_path: Path) -> None:
+    for end in ("killed", "stopped"):
+        run = ended_run(tmp_path / end, end, at=AT)
+        with (run / "config.resolved.yaml").open("a") as config:
+            config.write("\nride: {image: pva://X:Pva1:Image}\n")
+    died, stopped = (next_step(next((tmp_path / end).rglob("scan.h5"))) for end in ("killed", "stopped"))
+    assert died.startswith("Its scan has died: `beamline recover ") and "--resume" not in died
+    assert stopped == "It ended early, as a ride, which cannot be continued."
+
+
 def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path) -> None:
     run = ended_run(tmp_path, "killed", at=AT)
     go_on(run)
