@@ -81,8 +81,7 @@ class FistaTv(VoxelMethod):
         """The volume after the iterations, and the weight μ; `trial` as in `choose_weight`."""
         projector = problem.projector
         if not x.any():
-            # A sweep of OS-SIRT: a better start than zero, and the source of the density unit.
-            problem.sweeps(interleaved(projector, 9)).run(x, 1.0, problem.nonnegative, problem.rng)
+            problem.begin(x)
         weight: NoiseBalance | float
         unit = density_unit(x)
         if self.tv_weight is None:

@@ -227,6 +227,19 @@ def test_a_box_of_one_and_a_half_fields_is_wide_and_one_that_matches_is_not() ->
         assert trial is not None and trial.wide is wide
 
 
+def test_volumes_of_a_trial_have_the_density_of_a_sample_beyond_the_field() -> None:
+    """From FBP 1.19 of it, as the matter beside the field came last; levels of materials were wrong by as much."""
+    geometry = Geometry.parallel(np.linspace(0, np.pi, 48, endpoint=False), (4, 32), pixel_pitch=1.0)
+    box = Grid((4, 96, 96), 1.0)
+    _, y, x = np.indices(box.shape) - 47.5
+    away = np.hypot(x, y)
+    data = Projector(geometry, box).forward((away < 46).astype(np.float32))
+    trial = Trial.of(_problem_of(data, geometry, grid=box))
+    assert trial is not None
+    density = trial.volume_of_weight(0.02)[away[0] < 12].mean() * 2.0**trial.problem.units.density
+    assert density == pytest.approx(1, abs=0.04)
+
+
 @pytest.mark.parametrize("weighted", [False, True], ids=["even rays", "air weighs most"])
 def test_columns_of_air_hardly_change_volumes_of_a_trial(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, weighted: bool

@@ -69,12 +69,9 @@ def test_few_materials_that_predict_no_better_are_refused_after_two_volumes() ->
     assert not choice.materials.levels and len(trial.made) == recon.Discrete().refused_sweeps / 16
 
 
-@pytest.mark.parametrize(("wide", "levels"), [(False, None), (True, None), (True, (0.25, 1.0))])
-def test_of_a_sample_wider_than_the_field_few_materials_are_tried_with_stated_levels_alone(
-    wide: bool, levels: tuple[float, ...] | None
-) -> None:
-    trial: Any = ToldTrial({2: 0.98, 1: 0.95, 0.5: 0.96}, wide=wide)
-    choice = MaterialTrial(trial, 1.0, 16, levels)
+def test_of_a_sample_wider_than_the_field_all_of_total_variation_stays() -> None:
+    """Views held out prefer less of it for what lies beside the field, where the volume is worse by 0.5 to 0.8 dB."""
+    trial: Any = ToldTrial({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.69}, wide=True)
+    choice = MaterialTrial(trial, 1.0, 16, None)
     choice.choose()
-    tried = levels is not None or not wide
-    assert bool(choice.materials.levels) is tried and bool(trial.made) is tried
+    assert choice.materials.levels and choice.materials.tv_share == 1.0
