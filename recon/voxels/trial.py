@@ -43,10 +43,11 @@ def _share_in_field(geometry: Geometry, grid: Grid) -> float:
 
 
 def is_wide(projector: Projector, settings: TrialSettings) -> bool:
-    """Whether the sample, or the box, is wider than the field.
+    """Whether the sample goes on beyond the field, or the box is wider than that by a tenth.
 
-    There FBP is a false start. It leaves out the matter beside the field, which the steps then seek within: a disc
-    three times as wide had 1.16 to 1.32 of its density after twenty sweeps, from a sweep of OS-SIRT 0.97 to 0.98.
+    FBP is a poor first volume there: it leaves out the matter beside the field, and later steps put that into the
+    field. A disc three times as wide as the field came out at 1.16 to 1.32 times its density after twenty sweeps, and
+    at 0.97 to 0.98 from a sweep of OS-SIRT.
     """
     return settings.wide or _share_in_field(projector.geometry, projector.grid) <= _WIDE
 
@@ -63,8 +64,8 @@ def choose_weight(
     """The weight μ of min ½||A x - p||² + μ TV(x), x >= 0: by held-out views, if there are any, else by the noise.
 
     μ over the number of views follows the noise of a volume, which falls with the root of that number. So μ is √(8/7)
-    times that of the trial. It is sought from FBP: a fit knows the views held out, and any weight takes it away from
-    them.
+    times that of the trial. It is sought from the trial's first volume: a fit knows the views held out, and any weight
+    takes it away from them.
 
     Args:
         start, sweeps: as of `NoiseBalance.of`.
@@ -238,7 +239,7 @@ class Trial:
             return None
         wide = is_wide(problem.projector, settings)
         first = None if wide else seen.filtered("hann")
-        if first is None:  # no direct method takes these views, or knows how far the sample reaches
+        if first is None:  # no direct method takes these views
             depth, height, width = narrow_box.shape
             first = np.zeros((height, width, depth), np.float32)
         if wide:
@@ -295,10 +296,10 @@ class Trial:
 
     @property
     def wide(self) -> bool:
-        """Whether the sample, or the box, is wider than the field: patches are not tried.
+        """See `is_wide`: patches are not tried.
 
         What lies beside the field is in all views. So patches leave less of those held out where total variation is
-        closer to the truth, by 0.4 and 0.6 dB.
+        closer to the truth, by 0.4 and 0.6 dB of two samples.
         """
         return is_wide(self.scan.projector, self.settings)
 

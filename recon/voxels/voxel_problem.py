@@ -240,7 +240,7 @@ class VoxelProblem:
         return volume_lines(direct(images, geometry, self.projector.grid, filter, device=self.projector.device))
 
     def begin(self, x: F32) -> None:
-        """A sweep of OS-SIRT in a volume of zeros: a better start, and the source of the density unit."""
+        """Run a sweep of OS-SIRT on x [y, x, z], which is zero, in place: iterations go on better from it."""
         self.sweeps(interleaved(self.projector, 9)).run(x, 1.0, self.nonnegative, self.rng)
 
     def sweeps(self, subsets: Sequence[NDArray[np.intp]]) -> Sweeps:

@@ -49,10 +49,11 @@ class MaterialTrial:
         self.best, self.materials = self.smooth, MaterialPrior()
 
     def choose(self) -> None:
-        """Choose number of materials, share of total variation and pull; if `Trial.wide`, all of total variation stays.
+        """Choose number of materials, share of total variation and pull.
 
-        Views held out hold what lies beside the field, too, and prefer an eighth to a half of it there: of packed balls
-        in a can 1.5, 2 and 3 times as wide as the field, 0.5, 0.8 and 0.7 dB are lost by it.
+        If `Trial.wide`, all of total variation is kept, and no share is sought. Views held out also contain what lies
+        beside the field, and prefer an eighth to a half of it: of packed balls in a can 1.5, 2 and 3 times as wide as
+        the field that would cost 0.5, 0.8 and 0.7 dB.
         """
         wide = self._trial.wide
         first, *others = COUNTS if self._levels is None else (len(self._levels),)
@@ -118,7 +119,7 @@ class MaterialTrial:
             if self._levels is None
             else (np.array(self._levels), np.full(count, 1 / count))
         )
-        if self._trial.ended or not are_apart(levels):
+        if self._trial.ended or (self._levels is None and not are_apart(levels)):
             return np.full(self.smooth.shape, np.inf), MaterialPrior()
         first = MaterialPrior(tuple(levels.tolist()), tuple(weights.tolist()), tv_share, pull)
         none_thin, noise = np.broadcast_to(np.int8(0), self._start.shape), min(NOISE, LEAST_NOISE / math.sqrt(tv_share))

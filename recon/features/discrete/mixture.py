@@ -49,8 +49,11 @@ PARTIAL = (0.5, 0.9)
 """Probabilities of a partial voxel, within a material and where two meet."""
 EMPTY = 0.02
 """Of a typical high density: voxels below do not take part in the fit of levels."""
+LEAST_GAP = 0.1
+"""Between neighbouring levels by EM, over that between the outer ones. The air of a walnut from 50 views, in two levels
+0.03 apart, left 3 % less of views held out and changed nothing in its volume, and a fit that is better by 1 dB was not
+tried. The matrix of packed grains is parted so at 0.02 and 0.04, bone at 0.06."""
 _ROWS, _REACH = 4096, 6.0  # of the tables, and standard deviations beyond the outer levels
-_LEAST_GAP = 1e-3  # between neighbouring levels, over that between the outer ones
 _BINS, _ROUNDS, _LOOKED_AT = 400, 60, 300_007
 
 
@@ -90,8 +93,8 @@ def undecided_share(x: F32, materials: MaterialPrior) -> float:
 
 
 def are_apart(levels: F64) -> bool:
-    """Whether levels ascend; two of a volume of fewer materials may be one."""
-    return bool(np.diff(levels).min() > _LEAST_GAP * np.ptp(levels))
+    """Whether levels by EM are of different materials; of a volume of fewer, two may be one."""
+    return bool(np.diff(levels).min() > LEAST_GAP * np.ptp(levels))
 
 
 def gap_of(materials: MaterialPrior) -> float:

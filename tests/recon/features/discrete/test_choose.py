@@ -62,6 +62,16 @@ def test_the_heaviest_share_is_taken_that_predicts_views_within_2_percent(
     assert chosen_share(residuals_by_share) == pytest.approx(share)
 
 
+@pytest.mark.parametrize("levels", [None, (0.25, 0.27, 1.0)], ids=["two of three by EM", "three stated"])
+def test_levels_that_nearly_meet_are_tried_only_where_they_are_stated(levels: tuple[float, ...] | None) -> None:
+    """Two levels of air predicted the views held out of a walnut better than one, and changed nothing."""
+    trial: Any = ToldTrial({0.5: 1.01})
+    trial.smooth = np.array((0.25, 0.27, 1.0), np.float32)[np.arange(16 * 16 * 4).reshape(16, 16, 4) % 3]
+    trial._by_volume = {id(trial.smooth): 1.0}
+    MaterialTrial(trial, 1.0, 16, levels).choose()
+    assert len(trial.made) == 1
+
+
 def test_few_materials_that_predict_no_better_are_refused_after_two_volumes() -> None:
     trial: Any = ToldTrial({0.5: 1.01})
     choice = MaterialTrial(trial, 1.0, 16, None)
