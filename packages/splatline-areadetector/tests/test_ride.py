@@ -240,9 +240,9 @@ def test_the_cameras_count_shows_that_the_first_projections_were_lost(tmp_path: 
     def scan(stop: StopRequest) -> None:
         for i in range(20):
             if i >= lost:
-                ioc.send(range(100 + i, 101 + i), 0.02)
-            ioc.put({"cam1:NumImagesCounter_RBV": i + 1.0})
-            time.sleep(0.02)
+                ioc.send(range(100 + i, 101 + i), 0.01)
+            ioc.put({"cam1:NumImagesCounter_RBV": i + 1.0})  # at 0.01 of 0.1 s: what comes after 0.07 is of the next one
+            time.sleep(0.09)
 
     with FakeIoc(camera=True) as ioc:
         told = ride_along(config_of(tmp_path, ioc.url, camera="pva://T:cam1:"), tmp_path, scan)
