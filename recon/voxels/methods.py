@@ -81,7 +81,7 @@ class FistaTv(VoxelMethod):
         """The volume after the iterations, and the weight μ; `trial` as in `choose_weight`."""
         projector = problem.projector
         if not x.any():
-            problem.begin(x)
+            problem.first_sweep(x, problem.rng)
         weight: NoiseBalance | float
         unit = density_unit(x)
         if self.tv_weight is None:

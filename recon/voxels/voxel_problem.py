@@ -239,9 +239,13 @@ class VoxelProblem:
             return None
         return volume_lines(direct(images, geometry, self.projector.grid, filter, device=self.projector.device))
 
-    def begin(self, x: F32) -> None:
-        """Run a sweep of OS-SIRT on x [y, x, z], which is zero, in place: iterations go on better from it."""
-        self.sweeps(interleaved(self.projector, 9)).run(x, 1.0, self.nonnegative, self.rng)
+    def first_sweep(self, x: F32, rng: np.random.Generator | None) -> None:
+        """Run a sweep of OS-SIRT on x [y, x, z], which is zero, in place: iterations go on better from it.
+
+        Args:
+            rng: for the order of subsets; None: as they are.
+        """
+        self.sweeps(interleaved(self.projector, 9)).run(x, 1.0, self.nonnegative, rng)
 
     def sweeps(self, subsets: Sequence[NDArray[np.intp]]) -> Sweeps:
         return Sweeps(self.projector, self.data, self.weight, subsets)

@@ -241,7 +241,7 @@ def test_the_cameras_count_shows_that_the_first_projections_were_lost(tmp_path: 
         for i in range(20):
             if i >= lost:
                 ioc.send(range(100 + i, 101 + i), 0.01)
-            ioc.put({"cam1:NumImagesCounter_RBV": i + 1.0})  # of 0.1 s, 0.07 are waited for it
+            ioc.put({"cam1:NumImagesCounter_RBV": i + 1.0})  # counts until 0.7 of a period
             time.sleep(0.09)
 
     with FakeIoc(camera=True) as ioc:

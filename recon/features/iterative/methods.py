@@ -17,7 +17,7 @@ from recon.base.setting import Count, Natural, NonNegative, Positive
 from recon.kernels.cpu import tv as tv_cpu
 from recon.kernels.cpu.vectors import combine, dot, replace_by_residual
 from recon.voxels.iterative import VoxelMethod
-from recon.voxels.voxel_problem import Buffers, VoxelProblem, density_unit, difference_weights, interleaved
+from recon.voxels.voxel_problem import Buffers, VoxelProblem, density_unit, difference_weights
 
 
 @dataclass(frozen=True)
@@ -188,5 +188,5 @@ def _baseline(problem: VoxelProblem) -> float:
     if volume is None:
         nz, ny, nx = projector.grid.shape
         volume = np.zeros((ny, nx, nz), np.float32)
-        problem.sweeps(interleaved(projector, 9)).run(volume, 1.0, problem.nonnegative, None)
+        problem.first_sweep(volume, None)
     return math.sqrt(replace_by_residual(problem.data, projector.forward_lines(volume), problem.weight)) / problem.scale
