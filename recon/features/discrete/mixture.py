@@ -53,8 +53,8 @@ LEAST_GAP = 0.1
 """Between neighbouring levels by EM, over that between the outer ones. The air of a walnut from 50 views, in two levels
 0.03 apart, left 3 % less of views held out, changed its volume by 0.03 dB, and kept patches and a fit from being tried.
 The matrix of packed grains is parted so at 0.02 and 0.04, bone at 0.06. On scans it was not found on (a walnut of twice
-the columns from 60 views; pores, polyhedra of two densities, cracks) levels part at 0.01 to 0.04, and no volume changes:
-views held out refused the third level there, and 16 sweeps are saved."""
+the columns from 60 views; pores, polyhedra of two densities, cracks) levels part at 0.01 to 0.04, and no volume
+changes: views held out refused the third level there, and 16 sweeps are saved."""
 _ROWS, _REACH = 4096, 6.0  # of the tables, and standard deviations beyond the outer levels
 _BINS, _ROUNDS, _LOOKED_AT = 400, 60, 300_007
 
