@@ -1,4 +1,7 @@
-"""A soft IOC of Channel Access (caproto), a program of its own: a motor record on real time, and some variables."""
+"""A soft IOC of Channel Access (caproto), a program of its own: a motor record on real time, and some variables.
+
+Prints the port that it listens at, once it listens.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from drivers.base.clock import SystemClock
 from simulators.devices.trigger_line import TriggerLine
 from simulators.wires.epics.wire import CHOICES
 from tests.drivers.soft_ioc import PREFIX, Fields, Variables, record_of
+from tests.free_ports import free_ports
 
 BLADE = ("Closed", "Open")
 
@@ -44,9 +48,15 @@ def _served(served: Fields, choices: dict[str, tuple[str, ...]], prefix: str) ->
 
 
 if __name__ == "__main__":
+    (port,) = free_ports(1)
+    os.environ["EPICS_CA_SERVER_PORT"] = str(port)
+
+    async def say_port(library: object) -> None:
+        print(port, flush=True)
+
     clock = SystemClock()
     broken = Variables({"broken": 1.0}, severity=3)
     variables = Variables({"number": 1.5, "text": "mm", "blade": 0.0}, {"blade": BLADE})
     pvs = _served(record_of(clock, TriggerLine(clock)), CHOICES, f"{PREFIX}m1")
     pvs |= _served(variables, variables.choices, PREFIX) | _served(broken, {}, PREFIX)
-    run(pvs, interfaces=["127.0.0.1"], log_pv_names=False)
+    run(pvs, interfaces=["127.0.0.1"], log_pv_names=False, startup_hook=say_port)

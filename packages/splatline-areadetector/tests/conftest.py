@@ -9,22 +9,20 @@ from pathlib import Path
 
 import pytest
 
+from tests.free_ports import free_ports
+
 sys.path.insert(0, str(Path(__file__).parent))  # for the fakes beside the tests
 
 
 @cache
 def _ports_of_channel_access() -> list[int]:
     """Of servers and of beacons: its client reads them once in a process."""
-    from free_ports import free_ports  # beside this file
-
     return free_ports(2)
 
 
 @pytest.fixture(scope="module")
 def loopback() -> Iterator[dict[str, str]]:
     """The environment of EPICS's clients and servers, which this process has, too, meanwhile."""
-    from free_ports import free_ports
-
     (pva, server), (ca, beacons) = free_ports(2), _ports_of_channel_access()
     environment = {
         "EPICS_PVA_ADDR_LIST": "127.0.0.1", "EPICS_PVA_AUTO_ADDR_LIST": "NO", "EPICS_PVA_BROADCAST_PORT": f"{pva}",

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from free_ports import free_ports
 
 from beamline.config.load import load
 from beamline.core.errors import ConfigError
@@ -25,6 +24,7 @@ from drivers.base.protocols import CameraSettings, TriggerSource
 from drivers.testing.camera import CameraBench, CameraConformance
 from splatline_areadetector.camera import AreaDetectorCamera, AreaDetectorSettings
 from splatline_areadetector.camera_records import DRIVERS
+from tests.free_ports import free_ports
 
 FAKE = Path(__file__).with_name("fake_camera.py")
 SETTINGS = AreaDetectorSettings(

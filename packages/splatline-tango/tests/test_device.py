@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -24,6 +23,7 @@ from splatline_tango.device import ATTRIBUTES, ServerPlace, device_class, device
 from tests.beamline.cli.small_scan import beamline
 from tests.beamline.features.run_folder import FAILED, write_run
 from tests.beamline.scans import TwoCylinders, frames_of
+from tests.free_ports import free_ports
 
 WITHIN = 60.0  # s
 
@@ -151,9 +151,7 @@ print(json.dumps(stored[:3]), flush=True)
 
 @pytest.mark.slow
 def test_a_simulated_scan_is_paused_resumed_and_stopped_beside_a_real_server(tmp_path: Path) -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    (port,) = free_ports(1)
     command = [sys.executable, "-m", "beamline.cli.main"]
     server = [*command, "tango", str(tmp_path), "--control", "--port", str(port)]
     scan = [

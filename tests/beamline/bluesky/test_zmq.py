@@ -3,7 +3,6 @@
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ from beamline.bluesky.documents import published
 from beamline.cli.main import main
 from beamline.config.load import config_folder
 from tests.beamline.ran import SMALL
+from tests.free_ports import free_ports
 
 event_model = pytest.importorskip("event_model")
 pytest.importorskip("zmq")
@@ -27,9 +27,7 @@ WORDS = [word for setting in (*SMALL, "simulation.clock=virtual", "scan.mode=ste
 
 
 def _free() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{free.getsockname()[1]}"
+    return f"127.0.0.1:{free_ports(1)[0]}"
 
 
 @contextmanager

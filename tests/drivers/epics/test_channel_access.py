@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -25,15 +24,18 @@ URL = f"ca://{PREFIX}"
 
 
 @pytest.fixture(scope="module")
-def ioc() -> Iterator[ProcessVariable]:
+def ioc(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ProcessVariable]:
     """libca reads its addresses once in a process; nothing else here uses it."""
-    with socket.socket() as free, pytest.MonkeyPatch.context() as patch:
-        free.bind(("127.0.0.1", 0))
-        patch.setenv("EPICS_CA_SERVER_PORT", str(free.getsockname()[1]))
-        patch.setenv("EPICS_CA_ADDR_LIST", "127.0.0.1")
-        patch.setenv("EPICS_CA_AUTO_ADDR_LIST", "NO")
-        free.close()
-        with subprocess.Popen([sys.executable, "-m", "tests.drivers.ca_ioc"], stderr=subprocess.DEVNULL) as program:
+    errors = tmp_path_factory.mktemp("ioc") / "stderr"
+    with errors.open("w") as stderr, pytest.MonkeyPatch.context() as patch:
+        command = [sys.executable, "-m", "tests.drivers.ca_ioc"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stderr, text=True) as program:
+            assert program.stdout is not None
+            if not (port := program.stdout.readline().strip()):
+                pytest.fail(f"the soft IOC ended before it listened:\n{errors.read_text()}")
+            patch.setenv("EPICS_CA_SERVER_PORT", port)
+            patch.setenv("EPICS_CA_ADDR_LIST", "127.0.0.1")
+            patch.setenv("EPICS_CA_AUTO_ADDR_LIST", "NO")
             yield open_channel(URL, "device", 60.0)
             program.kill()
 
