@@ -30,7 +30,10 @@ MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 
 
 def exceeds_standard_error(gains: F64, errors: float) -> bool:
-    """Whether the mean gain [view held out] exceeds `errors` of its standard errors."""
+    """Whether the mean gain [view held out] exceeds `errors` of its standard errors; no gain of a candidate that was
+    ended, or diverged, does."""
+    if not np.isfinite(gains).all():
+        return False
     scatter = float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
     return float(gains.mean()) > errors * scatter
 

@@ -128,9 +128,11 @@ def solve_views(
     nonnegative: bool = True,
     watch: Watch = _UNWATCHED,
     decide: Decisions | None = None,
+    wide: bool = False,
 ) -> Volume:
-    """`solve` of views in the projector's geometry, with their weights; arguments and errors are the same."""
+    """`solve` of views in the projector's geometry, with their weights, `wide` as of `VoxelProblem`."""
     problem, lines = scaled_problem(projector, views, start, nonnegative, watch, decide or Decisions())
+    problem = replace(problem, wide=wide)
     with threads_for(projector.grid):
         found = method.iterate(problem, lines)
     return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
@@ -211,8 +213,9 @@ class VoxelMethod(Iterative):
         watch = Watch(report, TrialWatch(control, views, self.trial_sweeps))
         projector = Projector(problem.geometry, problem.grid, device=problem.device)
         volume = solve_views(
-            self, projector, problem.views.masked(), nonnegative=not self.allow_negative, watch=watch, decide=decide
-        )
+            self, projector, problem.views.masked(), nonnegative=not self.allow_negative, watch=watch, decide=decide,
+            wide=problem.wide,
+        )  # fmt: skip
         chosen = {name: decide.made[name][-1] for name in (TV_WEIGHT_CHOSEN,) if name in decide.made}
         return Reconstruction(volume, {**settings, **chosen, **decide.settings, "seed": problem.seed}, tuple(history))
 

@@ -27,7 +27,7 @@ from recon.voxels.choice import LEAST_GAIN, BestStrength, Prediction, TrialChoic
 from recon.voxels.field_edges import busiest_rows, columns_of_matter, middle_of_cone, slab_of
 from recon.voxels.held_out import LEAST_VIEWS, TRIAL_ROWS, TRIAL_SWEEPS
 from recon.voxels.priors import NoiseBalance, Pull, Subsets, noise_of_volume, ordered_fista, pnp_dct, subsets_of
-from recon.voxels.projector import Projector, volume_lines
+from recon.voxels.projector import volume_lines
 from recon.voxels.residuals import unseen_residuals
 from recon.voxels.voxel_problem import VoxelProblem, times_power
 
@@ -42,14 +42,14 @@ def _share_in_field(geometry: Geometry, grid: Grid) -> float:
     return 2 * geometry.reach / (grid.shape[2] * grid.voxel_size)
 
 
-def _is_wide(projector: Projector, settings: TrialSettings) -> bool:
+def _is_wide(problem: VoxelProblem) -> bool:
     """Whether the sample goes on beyond the field, or the box is wider than that by a tenth.
 
     FBP is a poor first volume there: it leaves out the matter beside the field, and later steps put that into the
     field. A disc three times as wide as the field came out at 1.16 to 1.32 times its density after twenty sweeps, and
     at 0.97 to 0.98 from a sweep of OS-SIRT.
     """
-    return settings.wide or _share_in_field(projector.geometry, projector.grid) <= _WIDE
+    return problem.wide or _share_in_field(problem.projector.geometry, problem.projector.grid) <= _WIDE
 
 
 def _trial_rows(geometry: Geometry, grid: Grid) -> int:
@@ -129,13 +129,11 @@ class TrialSettings:
     """The run that a trial belongs to.
 
     Attributes:
-        wide: the grid holds a sample beyond the field.
         all_rows: words for the rows of a trial of all of them, as of a cone whose middle shows little matter. Pixels
             may be joined for it, so that its priors are not those of the volume. Empty: a trial of some rows.
         now: the clock.
     """
 
-    wide: bool = False
     all_rows: str = ""
     now: Clock = time.perf_counter
 
@@ -237,7 +235,7 @@ class Trial:
         seen, unseen = (of_views(some, cols, narrow, narrow_box) for some in split_views(views))
         if unseen.weight is not None and not unseen.weight.any(axis=(1, 2)).any():
             return None
-        wide = _is_wide(problem.projector, settings)
+        wide = _is_wide(problem)
         first = None if wide else seen.filtered("hann")
         if first is None:  # no direct method takes these views
             depth, height, width = narrow_box.shape
@@ -301,7 +299,7 @@ class Trial:
         What lies beside the field is in all views. So patches leave less of those held out where total variation is
         closer to the truth, by 0.4 and 0.6 dB of two samples.
         """
-        return _is_wide(self.scan.projector, self.settings)
+        return _is_wide(self.scan)
 
     @cached_property
     def prior(self) -> Prior | None:
@@ -362,7 +360,7 @@ class Trial:
     def views_of(self, method: Method) -> ReconProblem:
         """The views that are not held out as a method gets them, with all columns and in the units of the scan."""
         problem = self.all_columns.seen().of_scan
-        return replace(problem, device=method.device_of(problem), wide=self.settings.wide)
+        return replace(problem, device=method.device_of(problem))
 
     def lines_of(self, volume: Volume) -> F32:
         """A volume made of `views_of` as one of the trial, [y, x, z]."""

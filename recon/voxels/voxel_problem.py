@@ -178,6 +178,7 @@ class VoxelProblem:
         measured: the views as measured, where `data` are smoothed since voxels are too coarse for them; else None.
         with_all_columns: makes the problem with all columns, where these are some; steps are as long as of that one.
         units: of all lengths, line integrals and weights here.
+        wide: the grid holds a sample beyond the field.
     """
 
     projector: Projector
@@ -191,6 +192,7 @@ class VoxelProblem:
     measured: F32 | None = None
     with_all_columns: Callable[[], VoxelProblem] | None = None
     units: Units = _NO_UNITS
+    wide: bool = False
     _norms: list[tuple[Projector, F32 | None, float]] = field(default_factory=list, repr=False)  # of copies, too
 
     @property
@@ -216,7 +218,7 @@ class VoxelProblem:
         data = times_power(projection_images(self.views).copy(), self.units.integral)
         weights = None if rays is None else times_power(projection_images(rays).copy(), self.units.weight)
         views = Views(data, projector.geometry, weights)
-        return ReconProblem(views, projector.grid, device=projector.device)
+        return ReconProblem(views, projector.grid, device=projector.device, wide=self.wide)
 
     @property
     def views(self) -> F32:

@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 import recon
 from recon.auto import Auto
 from recon.base.decisions import Decisions, Prior
-from recon.base.method import SWEEPS_OF_TRIALS, ReconProblem, Reconstruction, RunControl
+from recon.base.method import SWEEPS_OF_TRIALS, Method, ReconProblem, Reconstruction, RunControl
 from recon.base.view_data import Views
 from recon.base.volume import Volume
+from recon.methods import by_name
 from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.direct import Fbp
 from recon.voxels.methods import FistaTv
 from recon.voxels.projector import Projector
 from recon.voxels.trial import Trial
+from recon.voxels.voxel_problem import VoxelProblem
 
 F32 = NDArray[np.float32]
 VIEWS = recon.Geometry.parallel(np.linspace(0, np.pi, 24, endpoint=False), (40, 32))
@@ -101,6 +103,23 @@ def test_a_method_that_does_not_take_the_views_is_left_out(data: F32) -> None:
     assert recon.reconstruct(data, VIEWS, Auto((Refusing(), Scaled()))).settings["factor"] == 1.0
     with pytest.raises(ValueError, match="fbp: not these"):
         recon.reconstruct(data, VIEWS, Auto((Refusing(),)))
+
+
+@pytest.mark.parametrize("method", [Auto(), *(by_name(name)() for name in ("fista-tv", "pnp-dct", "discrete", "r2"))])
+def test_a_sample_slightly_wider_than_the_field_is_wide_for_every_method(
+    method: Method, data: F32, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wider by less than a tenth, which the box alone does not tell."""
+    asked = list[bool]()
+
+    def of(problem: VoxelProblem, *_: object) -> None:
+        asked.append(problem.wide)
+
+    monkeypatch.setattr(Trial, "of", of)
+    for wide in (True, False):
+        method.toy().run(ReconProblem(Views(data, VIEWS), GRID, wide=wide), recon.RunControl())
+        assert asked and set(asked) == {wide}
+        asked.clear()
 
 
 def test_patches_are_not_tried_of_a_sample_wider_than_the_field(data: F32, monkeypatch: pytest.MonkeyPatch) -> None:

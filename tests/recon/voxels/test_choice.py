@@ -36,6 +36,7 @@ def test_beyond_chance_is_more_than_a_standard_error_in_any_unit(gains: NDArray[
     error = float(gains.std(ddof=1)) / math.sqrt(6)
     assume(abs(gains.mean() - error) > 1e-6)
     assert exceeds_standard_error(unit * gains, 1.0) == (gains.mean() > error)
+    assert not exceeds_standard_error(np.append(gains, np.inf), 1.0)  # the other candidate was ended
 
 
 @pytest.mark.parametrize(
