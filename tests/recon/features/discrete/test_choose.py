@@ -79,9 +79,9 @@ def test_few_materials_that_predict_no_better_are_refused_after_two_volumes() ->
     assert not choice.materials.levels and len(trial.made) == recon.Discrete().refused_sweeps / 16
 
 
-def test_of_a_sample_wider_than_the_field_all_of_total_variation_stays() -> None:
+def test_of_a_sample_wider_than_the_field_no_less_of_total_variation_is_tried() -> None:
     """Views held out prefer less of it for what lies beside the field, where the volume is worse by 0.5 to 0.8 dB."""
     trial: Any = ToldTrial({2: 0.98, 1: 0.80, 0.5: 0.70, 0.25: 0.69}, wide=True)
     choice = MaterialTrial(trial, 1.0, 16, None)
     choice.choose()
-    assert choice.materials.levels and choice.materials.tv_share == 1.0
+    assert choice.materials.levels and choice.materials.tv_share == pytest.approx(1.065, abs=1e-3)
