@@ -130,8 +130,8 @@ def solve_views(
     decide: Decisions | None = None,
     wide: bool = False,
 ) -> Volume:
-    """`solve` of views in the projector's geometry, with their weights; `wide` as of `VoxelProblem`, the other arguments
-    and errors as there."""
+    """`solve` of views in the projector's geometry, with their weights; `wide` as of `VoxelProblem`, other
+    arguments and errors as there."""
     problem, lines = scaled_problem(projector, views, start, nonnegative, watch, decide or Decisions())
     problem = replace(problem, wide=wide)
     with threads_for(projector.grid):
