@@ -116,8 +116,8 @@ def _trial(problem: ReconProblem, all_rows: str, control: RunControl, candidates
     sweeps = max(_sweeps(each) for each in candidates)
     watch = Watch(on_trial=TrialWatch(told, problem.geometry.n_views, sweeps))
     projector, decide = Projector(problem.geometry, problem.grid, device=problem.device), Decisions(problem.seed)
-    scan, _ = scaled_problem(projector, problem.views.masked(), None, True, watch, decide)
-    return Trial.of(replace(scan, wide=problem.wide), TrialSettings(all_rows, control.now))
+    scan, _ = scaled_problem(projector, problem.views.masked(), None, True, watch, decide, problem.wide)
+    return Trial.of(scan, TrialSettings(all_rows, control.now))
 
 
 def _sweeps(method: Method) -> int:

@@ -132,8 +132,7 @@ def solve_views(
 ) -> Volume:
     """`solve` of views in the projector's geometry, with their weights; `wide` as of `VoxelProblem`, other
     arguments and errors as there."""
-    problem, lines = scaled_problem(projector, views, start, nonnegative, watch, decide or Decisions())
-    problem = replace(problem, wide=wide)
+    problem, lines = scaled_problem(projector, views, start, nonnegative, watch, decide or Decisions(), wide)
     with threads_for(projector.grid):
         found = method.iterate(problem, lines)
     return Volume(volume_slices(times_power(found, problem.units.density)), projector.grid)
@@ -152,9 +151,15 @@ def threads_for(grid: Grid) -> Iterator[None]:
 
 
 def scaled_problem(
-    projector: Projector, views: Views, start: Volume | None, nonnegative: bool, watch: Watch, decide: Decisions
+    projector: Projector,
+    views: Views,
+    start: Volume | None,
+    nonnegative: bool,
+    watch: Watch,
+    decide: Decisions,
+    wide: bool,
 ) -> tuple[VoxelProblem, F32]:
-    """The problem of these views in units of about one, and the first volume [y, x, z]; arguments as of `solve`."""
+    """The problem of these views in units of about one, and its first volume [y, x, z]; see `solve_views`."""
     data, rays = _checked(projector, views.data, views.weights)
     lines = _start(projector, start)
     units = Units(*decide(UNITS, lambda: Units.of(projector, data, rays)))
@@ -167,7 +172,7 @@ def scaled_problem(
     problem = VoxelProblem(
         inside, at_voxels, rays, nonnegative, np.random.default_rng(decide.seed),
         lambda iteration, residual: not watch.on_iteration(iteration, residual), decide, lambda: not watch.on_trial(),
-        measured=None if at_voxels is data else data, units=units,
+        measured=None if at_voxels is data else data, units=units, wide=wide,
     )  # fmt: skip
     return problem, lines
 
