@@ -174,7 +174,7 @@ def _refitted(
         decide = Decisions(problem.seed, follow)
         refitted = solve_views(
             refit, projector, trusted, start=volume, nonnegative=not method.allow_negative, watch=Watch(told),
-            decide=decide,
+            decide=decide, wide=problem.wide,
         )  # fmt: skip
         if stopped:
             return None

@@ -30,8 +30,8 @@ MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 
 
 def exceeds_standard_error(gains: F64, errors: float) -> bool:
-    """Whether the mean gain [view held out] exceeds `errors` of its standard errors; no gain of a candidate that was
-    ended, or diverged, does."""
+    """Whether the mean gain [view held out] exceeds `errors` of its standard errors. False: a gain is not finite, as a
+    candidate was ended, or diverged."""
     if not np.isfinite(gains).all():
         return False
     scatter = float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
