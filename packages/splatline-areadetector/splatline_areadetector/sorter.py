@@ -75,9 +75,10 @@ class Seen:
     frame: Any = None
     era: int = 0
 
-    def repeats(self, other: Seen) -> bool:
-        """Whether it is the same frame once more, where the numbers are the same."""
-        return np.array_equal(self.pixels, other.pixels)
+    def repeats(self, other: Seen, *, is_last: bool) -> bool:
+        """Whether it is the same frame as one of its number, sent once more: at once, or later with the same time."""
+        is_same = self.phase == other.phase and (is_last or self.time == other.time)
+        return is_same and np.array_equal(self.pixels, other.pixels)
 
 
 class Basis(Enum):
@@ -174,8 +175,13 @@ class _Taken:
         return (number - self.first) // self.step
 
     @property
+    def end(self) -> int:
+        """Number of the first frame beyond the plan."""
+        return self.first + self.n * self.step
+
+    @property
     def is_over(self) -> bool:
-        return self.closed or self.trigger(self.last) >= self.n - 1
+        return self.closed or self.last >= self.end - self.step
 
 
 def not_set(number: int) -> str:
@@ -228,17 +234,21 @@ class Sorter:
         last, newest = self._last, self.held[-1] if self.held else self._last
         number = self._unwrapped(seen.number, is_anew=seen.reconnected)
         era = 0 if newest is None else newest.era
+        is_within = last is not None and era == last.era
         same = [each for each in (*self._recent, *self.held) if (each.number, each.era) == (number, era)]
-        if same and not seen.reconnected and same[-1].repeats(seen):
+        if same and not seen.reconnected and seen.repeats(same[-1], is_last=same[-1] is newest):
             self.repeats += 1
             yield replace(seen, number=number), Outside(repeated=True)
             return
-        if last is not None and era != last.era and number == last.number + max(self._step, 1) and not seen.reconnected:
+        if (
+            last is not None and era > last.era and number == last.number + max(self._step, 1)
+            and len(self.held) == 1 and seen.phase == last.phase != self.held[0].phase
+        ):  # fmt: skip
             era = last.era  # exchanged with the first one of a new count
         elif newest is not None and (
             bool(same)
-            or number < newest.number - WINDOW * max(self._step, 1)
-            or (last is not None and era == last.era and number <= last.number)
+            or number < newest.number - (WINDOW if is_within else 1) * max(self._step, 1)
+            or (is_within and last is not None and number <= last.number)
             or (seen.reconnected and number <= newest.number)
         ):
             era += 1
@@ -321,7 +331,7 @@ class Sorter:
         """Where a frame belongs that begins no file."""
         kind, views = seen.phase.kind, self._views
         if seen.phase == NOT_TOLD:
-            if block is None or is_anew or block.closed or block.trigger(seen.number) >= block.n:
+            if block is None or is_anew or block.closed or seen.number >= block.end:
                 return Unknown("nothing tells whether it is a dark, a flat or a projection")
         elif seen.phase == BY_ORDER:
             self._by_order(seen, block, is_anew)
@@ -343,15 +353,15 @@ class Sorter:
         skipped, block.last = range(block.trigger(block.last) + 1, trigger), seen.number
         block.triggers.add(trigger)
         if seen.reconnected and not self._note and len(block.triggers) > 1:
-            self._note = f"The server had gone before frame {seen.number}, which is placed as if its count had gone on meanwhile."
+            self._note = f"The server had gone before frame {seen.number}: it is placed as if the count had gone on."
         return Place(self._now, block.kind, trigger, skipped, block.basis)
 
     def _outside(self, seen: Seen, block: _Taken | None) -> Outside:
         """A frame that is not stored. By its number the present block may be over, whatever is missing at its end."""
-        if block is None or block.closed or block.trigger(seen.number) < block.n:
+        if block is None or block.closed or seen.number < block.end:
             return Outside()
-        end, block.closed = block.first + block.n * block.step, True
-        return Outside(lost=range(block.last + block.step, end if seen.era == block.era else 0, block.step))
+        block.closed = True
+        return Outside(lost=range(block.last + block.step, block.end if seen.era == block.era else 0, block.step))
 
     def _by_order(self, seen: Seen, block: _Taken | None, is_anew: bool) -> None:
         """Open the planned block that follows from the order of blocks and their counts."""
@@ -374,7 +384,7 @@ class Sorter:
         views, lost, basis = self._views, 0, Basis.WAITED
         if views is not None and not views.is_over:  # within the projections, or at their end, some of which are lost
             n_left = views.n - 1 - views.trigger(views.last)
-            views.closed = views.trigger(seen.number) >= views.n if seen.era == views.era else n_left <= WINDOW
+            views.closed = seen.number >= views.end if seen.era == views.era else n_left <= WINDOW
         is_later = views is None or views.is_over
         planned = [(i, each) for i, each in enumerate(self._planned) if each.kind is kind]
         free = [i for i, _ in planned if i not in self._taken and (is_later or VIEW in self._kinds(i))]
@@ -415,8 +425,8 @@ class Sorter:
                 self._note = f"The camera had counted {words} before the first that came." if lost else self._note
                 return lost, Basis.COUNTER
         block = self._taken.get(self._now)
-        is_whole = block is not None and block.trigger(block.last) == block.n - 1
-        if gap is not None and gap < n and is_whole and known is not None and known.phase.kind is not None:
+        is_whole = known is not None and block is not None and known.number == block.last == block.end - block.step
+        if gap is not None and gap < n and is_whole:
             return gap, Basis.WHOLE
         is_late = self._joined or seen.reconnected or gap is not None or (is_anew and seen.number > 1)
         if not is_late and not is_anew and known is not None and second is not None:
@@ -458,7 +468,7 @@ class Sorter:
     def pass_over(self, raw: int) -> range:
         """Frames up to this number of the present block will not come; the numbers of those that had not come yet."""
         block, number = self._taken.get(self._now), self._unwrapped(raw)
-        if block is None or block.closed or number <= block.last or block.trigger(number) >= block.n:
+        if block is None or block.closed or not block.last < number < block.end:
             return range(0)
         lost, block.last = range(block.last + block.step, number + 1, block.step), number
         self._last = None if self._last is None else replace(self._last, number=number)
