@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -231,29 +232,32 @@ class Sorter:
     def take(self, seen: Seen) -> Iterator[tuple[Seen, Decision]]:
         """Take the next frame. Where each frame that waits no longer belongs, in the order of their numbers: see
         `decided`."""
-        last, newest = self._last, self.held[-1] if self.held else self._last
+        newest = self.held[-1] if self.held else self._last
         number = self._unwrapped(seen.number, is_anew=seen.reconnected)
         era = 0 if newest is None else newest.era
-        is_within = last is not None and era == last.era
         same = [each for each in (*self._recent, *self.held) if (each.number, each.era) == (number, era)]
         if same and not seen.reconnected and seen.repeats(same[-1], is_last=same[-1] is newest):
             self.repeats += 1
             yield replace(seen, number=number), Outside(repeated=True)
             return
-        if (
-            last is not None and era > last.era and number == last.number + max(self._step, 1)
-            and len(self.held) == 1 and seen.phase == last.phase != self.held[0].phase
-        ):  # fmt: skip
-            era = last.era  # exchanged with the first one of a new count
-        elif newest is not None and (
-            bool(same)
-            or number < newest.number - (WINDOW if is_within else 1) * max(self._step, 1)
-            or (is_within and last is not None and number <= last.number)
-            or (seen.reconnected and number <= newest.number)
-        ):
-            era += 1
+        if newest is not None and number <= newest.number:
+            era = self._era_of(seen, number, newest) + bool(same)
         insort(self.held, replace(seen, number=number, era=era), key=lambda each: (each.era, each.number))
         yield from self.decided(2)
+
+    def _era_of(self, seen: Seen, number: int, newest: Seen) -> int:
+        """The era of a frame whose number is not beyond that of the newest one: exchanged, or numbered anew."""
+        last, step = self._last, self._step or 1
+        one_before = [each.number for each in self.held[:-1] if each.era == newest.era]
+        if seen.reconnected:
+            return newest.era + 1
+        if last is not None and last.era == newest.era:
+            return newest.era + (number <= last.number or number < newest.number - WINDOW * step)
+        if last is not None and len(self.held) == 1 and seen.phase == last.phase != newest.phase:
+            return newest.era - (number == last.number + step)
+        if one_before:
+            return newest.era + (number <= one_before[-1])
+        return newest.era + (seen.phase != newest.phase or number < newest.number - step)
 
     def decided(self, patience: int) -> Iterator[tuple[Seen, Decision]]:
         """Where each frame that waits no longer belongs.
@@ -315,11 +319,13 @@ class Sorter:
 
     def _learn_step(self, seen: Seen, last: Seen, block: _Taken) -> None:
         """By how much numbers rise from frame to frame: by more than 1 where all of some do, and none was lost."""
-        following = [seen, *(each for each in self.held if each.era == seen.era)]
-        step = math.gcd(*(each.number - last.number for each in following))
-        lost = self._witness is not None and self._witness.were_lost(last.time, following[-1].time, len(following))
-        self._step = 1 if len(following) < 2 or lost else step
-        block.step = self._step
+        following = [last, seen, *self.held]
+        rises = [b.number - a.number for a, b in pairwise(following) if a.era == b.era]
+        step = math.gcd(*rises)
+        if len(rises) < 2 and step > 1:
+            return
+        lost = self._witness is not None and self._witness.were_lost(last.time, following[-1].time, len(rises))
+        self._step = block.step = 1 if lost else step
         if self._step > 1:
             self._note = (
                 f"The numbers of frames rise by {step}: a plugin averages {step} frames, or passes on each {step}th. "
