@@ -283,7 +283,7 @@ class Sorter:
         return patience > 1 or (patience == 1 and goes_on and self._step == 0 and len(self.held) < 2)
 
     def _decide(self, seen: Seen, patience: int) -> Decision:
-        last, block, self._note = self._last, self._taken.get(self._now), ""
+        last, block = self._last, self._taken.get(self._now)
         if self._size not in (None, seen.size):
             is_alone = not patience or any(each.size == self._size for each in self.held)
             return Unknown("it has another size than the others", fits=False) if is_alone else NewEpoch("")
@@ -301,7 +301,9 @@ class Sorter:
         self._known, views = seen, self._views
         if views is not None and not (isinstance(place, Place) and self._taken[place.block] is views):
             views.away = views.away or seen
-        return replace(place, note=self._note) if isinstance(place, Place) else place
+        if isinstance(place, Place):
+            place, self._note = replace(place, note=self._note), ""
+        return place
 
     def _new_epoch(self, seen: Seen, last: Seen, block: _Taken) -> str:
         """Why the file ends, where numbers have begun anew; "": another block begins, or none."""
@@ -466,6 +468,8 @@ class Sorter:
             if top - _NEAR <= last <= top and low <= raw <= low + _NEAR and not is_anew:
                 self._turned = top - low + (low != 0 or raw == 0)  # cameras of GigE Vision leave out 0
                 self._turn += self._turned
+                if last < top or raw > low + 1:
+                    self._note = f"Numbers went from {last} to {raw}: as if the counter had gone on beyond {top}."
             elif self._turned and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
                 self._raw = last  # exchanged with its neighbour
                 return raw + self._turn - self._turned
