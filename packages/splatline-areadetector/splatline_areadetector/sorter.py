@@ -298,7 +298,7 @@ class Sorter:
         self._recent.append(seen)
         if isinstance(place, Unknown):
             return place
-        self._known, views = seen, self._views
+        self._known, views = self._known if seen.phase == NOT_TOLD else seen, self._views
         if views is not None and not (isinstance(place, Place) and self._taken[place.block] is views):
             views.away = views.away or seen
         if isinstance(place, Place):
@@ -433,9 +433,16 @@ class Sorter:
                 self._note = f"The camera had counted {words} before the first that came." if lost else self._note
                 return lost, Basis.COUNTER
         block = self._taken.get(self._now)
-        is_whole = known is not None and block is not None and known.number == block.last == block.end - block.step
-        if gap is not None and gap < n and is_whole:
-            return gap, Basis.WHOLE
+        if (
+            block is not None
+            and gap is not None
+            and known is not None
+            and known.number == block.last == block.end - step
+        ):
+            lost = gap - sum(each.n for each in self._planned[self._now + 1 : self._kinds(0).index(VIEW)])
+            if 0 <= lost < n:
+                self._note = f"Frames just before {seen.number} were lost: {lost} are taken for the first projections."
+                return lost, Basis.WHOLE
         is_late = self._joined or seen.reconnected or gap is not None or (is_anew and seen.number > 1)
         if not is_late and not is_anew and known is not None and second is not None:
             is_late = seen.time - known.time <= _RUNNING * (second.time - seen.time)
