@@ -79,7 +79,9 @@ def wait_for_scan(ride: Ride, first_id: int | None, *, joined: bool) -> tuple[Ar
     stream, guide = ride.stream, ride.guide
     silence = Silence(stream, ride.counters, ride.config.ride.silence_s, ride.say, lambda: "Nothing was recorded.")
     told, known = False, stream.first
-    before = None if joined or known is None else Seen(known.unique_id, BY_ORDER, known.time)
+    before = None if known is None else Seen(known.unique_id, BY_ORDER, known.time)
+    if joined and known is not None:
+        before = seen_of(known, guide)
     ride.say(f"Waiting for the first frame of a scan from {stream.name}{_shown(ride)}")
     while not ride.stop.stopping:
         item = stream.next(SLICE)

@@ -419,32 +419,26 @@ class Sorter:
         """Frames of a block of n that were lost before the first that came, and what tells it."""
         known, step = self._known, self._step or 1
         second = next((each for each in self.held if each.era == seen.era), None)
-        gap = None
-        if known is not None and known.era == seen.era and not seen.reconnected:
-            is_other = known.phase != BY_ORDER and known.phase.kind is not seen.phase.kind
-            gap = (seen.number - known.number) // step - 1 if is_other else None
+        gap, is_other = n, known is not None and known.phase != BY_ORDER and known.phase.kind is not seen.phase.kind
+        if known is not None and is_other and known.era == seen.era and not seen.reconnected:
+            gap = (seen.number - known.number) // step - 1  # from n on it is another count
         if gap == 0:
             return 0, Basis.NUMBERS
         if self._witness is not None and (second is None or second.number == seen.number + step):
             counted = self._witness.counted(seen.time, None if second is None else second.time)
             lost = -1 if counted is None else counted // step - 1
-            if 0 <= lost < n and (gap is None or lost <= gap):
+            if 0 <= lost < n and lost <= gap:
                 words = "1 projection" if lost == 1 else f"{lost} projections"
                 self._note = f"The camera had counted {words} before the first that came." if lost else self._note
                 return lost, Basis.COUNTER
         block = self._taken.get(self._now)
-        if (
-            block is not None
-            and gap is not None
-            and known is not None
-            and known.number == block.last == block.end - step
-        ):
+        if gap < n and known is not None and block is not None and known.number == block.last == block.end - step:
             lost = gap - sum(each.n for each in self._planned[self._now + 1 : self._kinds(0).index(VIEW)])
             if 0 <= lost < n:
                 self._note = f"Frames just before {seen.number} were lost: {lost} are taken for the first projections."
                 return lost, Basis.WHOLE
-        is_late = self._joined or seen.reconnected or gap is not None or (is_anew and seen.number > 1)
-        if not is_late and not is_anew and known is not None and second is not None:
+        is_late = self._joined or seen.reconnected or gap < n or (is_anew and seen.number > 1)
+        if not (is_late or is_anew or is_other) and known is not None and second is not None:
             is_late = seen.time - known.time <= _RUNNING * (second.time - seen.time)
         if is_late:
             self._note = (

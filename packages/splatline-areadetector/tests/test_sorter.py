@@ -170,6 +170,7 @@ def test_the_first_projection_by_its_number() -> None:
         (seen(range(1, 6), FLATS), None, range(6, 66), 6, Basis.NUMBERS),
         (seen(range(1, 6), FLATS), None, range(7, 66), 6, Basis.WHOLE),
         (seen(range(1, 5), FLATS), None, range(7, 66), 7, Basis.UNKNOWN),  # a flat, or a projection
+        (seen(range(1, 6), FLATS), None, range(65500, 65560), 65500, Basis.WAITED),  # another count
         ([], None, range(7, 60), 7, Basis.WAITED),
         ([], 3, range(7, 60), 5, Basis.COUNTER),
     ],
@@ -178,7 +179,8 @@ def test_what_the_first_projection_rests_on(
     before: list[Seen], camera: int | None, came: range, first: int, basis: Basis
 ) -> None:
     sorter = Sorter([PlannedBlock(FLAT, 5), PlannedBlock(VIEW, 60)], witness=Counts(camera))
-    decided = sort(sorter, [*before, *seen(came, VIEWS)])
+    frames = [*before, *seen(came, VIEWS)]
+    decided = sort(sorter, [replace(frame, time=float(i)) for i, frame in enumerate(frames)])
     assert triggers(decided) == {number: number - first for number in came if number - first < 60}
     assert sorter.basis is basis and ("Nothing tells whether frame" in notes(decided)) is (basis is Basis.UNKNOWN)
 
