@@ -289,7 +289,7 @@ class Sorter:
             return Unknown("it has another size than the others", fits=False) if is_alone else NewEpoch("")
         is_anew = last is not None and seen.era != last.era
         if last is not None and block is not None:
-            if is_anew and (why := self._new_epoch(seen, last, block)):
+            if (is_anew or self._is_another_count(seen, last)) and (why := self._new_epoch(seen, last, block)):
                 return NewEpoch(why)
             if not (is_anew or self._step):
                 self._learn_step(seen, last, block)
@@ -304,6 +304,14 @@ class Sorter:
         if isinstance(place, Place):
             place, self._note = replace(place, note=self._note), ""
         return place
+
+    def _is_another_count(self, seen: Seen, last: Seen) -> bool:
+        """Whether a number that rose while the server had gone rose by far more or less than the time did."""
+        if not seen.reconnected or seen.era != self._recent[0].era or last.number == self._recent[0].number:
+            return False
+        period = (last.time - self._recent[0].time) / (last.number - self._recent[0].number)
+        expected = (seen.number - last.number) * period
+        return not expected / 2 <= seen.time - last.time <= 2 * expected + 2 * period
 
     def _new_epoch(self, seen: Seen, last: Seen, block: _Taken) -> str:
         """Why the file ends, where numbers have begun anew; "": another block begins, or none."""

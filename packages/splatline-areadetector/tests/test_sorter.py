@@ -113,6 +113,16 @@ def test_a_number_that_falls_within_a_block_is_another_epoch() -> None:
     assert triggers(sort(Sorter(BLOCKS), [*seen((7, 8), DARKS), *seen((2, 3), VIEWS)])) == {2: 0, 3: 1}
 
 
+def test_a_server_that_had_gone_and_the_time_tell_whether_its_count_went_on() -> None:
+    before = [Seen(i, VIEWS, time=0.1 * i) for i in range(1, 9)]
+    blocks = [PlannedBlock(VIEW, 60)]
+    for number, seconds, goes_on in ((20, 1.2, True), (20, 5.0, False), (40, 1.2, False)):
+        after = Seen(number, VIEWS, time=0.8 + seconds, reconnected=True)
+        *_, (_, last) = sort(Sorter(blocks), [*before, after])
+        assert isinstance(last, Place if goes_on else NewEpoch)
+        assert not goes_on or "placed as if the count had gone on" in getattr(last, "note", "")
+
+
 def test_free_run_after_the_last_view_is_no_epoch() -> None:
     """A camera that counts from each start runs free before tomoscan says that its scan is complete."""
     sorter = Sorter([PlannedBlock(VIEW, 2)])
