@@ -21,6 +21,8 @@ CAMERA = ("PortName_RBV", "Acquire_RBV", "DetectorState_RBV", "ArrayCallbacks_RB
           "ArrayCounter_RBV", "AcquireTime_RBV", "AcquirePeriod_RBV", "BinX_RBV", "BinY_RBV")  # fmt: skip
 _LONG = 0.3  # s without the processor that may fill the server's queue
 OURS = "this program"
+_SETTLES = 0.2  # s in which the camera's counter comes here
+_REST, _LEAST, _SLOW = 5, 0.5, 10.0  # periods, s without a count that are a pause; s, of a camera that is slow
 _SKIPPED = "Nothing was recorded."
 _PLUGINS = ("OVER", "ROI", "PROC", "TRANS", "CC", "STATS", "FFT", "CB", "CODEC", "SCATTER", "GATHER", "ATTR")
 """Beginnings of the usual port names of plugins: what they give out may be no camera's frame."""
@@ -57,6 +59,23 @@ class Counters:
             self.plugin = opened.enter_context(Variables(f"{scheme}://{name.rpartition(':')[0]}:", PLUGIN))
             self.camera = None if camera is None else opened.enter_context(Variables(camera, CAMERA, CAMERA[:1]))
             self.close = opened.pop_all().close
+
+    def counted(self, first: float, second: float | None) -> int | None:
+        """See `Witness`. The counter comes here somewhat after the frame that it counts. Only its rise says something:
+        a camera may have run free before."""
+        if self.camera is None:
+            return None
+        time.sleep(_SETTLES)
+        period = _SLOW if second is None else second - first
+        rise = self.camera.histories["NumImagesCounter_RBV"].risen(first + 0.7 * period, max(_REST * period, _LEAST))
+        return None if rise is None else int(rise)
+
+    def were_lost(self, begin: float, end: float, n: int) -> bool:
+        """See `Witness`."""
+        rises = [
+            self.plugin.histories[name].rise(begin, end) or 0.0 for name in ("DroppedArrays_RBV", "ArrayCounter_RBV")
+        ]
+        return rises[0] > 0 or rises[1] > n
 
     def blame(self, gap: Gap) -> str:
         """Whose loss it was, as a sentence's end."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,7 +25,7 @@ from splatline_areadetector.config import (
     TomoscanAngles,
 )
 from splatline_areadetector.plan import PlannedBlock, RidePlan
-from splatline_areadetector.sorter import NO_SCAN, Phase
+from splatline_areadetector.sorter import BY_ORDER, NOT_TOLD, Phase
 from splatline_areadetector.variables import History, Variables
 
 LOCATIONS = {"data_dark": FrameKind.DARK, "data_white": FrameKind.FLAT, "data": FrameKind.PROJECTION}
@@ -44,9 +44,6 @@ SKEW = 0.5  # s by which the clocks of two IOCs may differ and still count as se
 
 class Guide(Protocol):
     """Tells what a scan plans, and of each frame its kind and angle. It only reads."""
-
-    def begin(self, first_id: int | None) -> None:
-        """Another file begins. `first_id`: number of its first projection; None: that of the first one that comes."""
 
     def plan(self) -> RidePlan:
         """The plan as it stands now. ConfigError where it cannot be."""
@@ -68,32 +65,21 @@ class Guide(Protocol):
 
 
 class _Kinds:
-    """The kinds of frames by an attribute, each change of which begins a block; without one, by the planned order."""
+    """The kinds of frames by an attribute; without one, by the planned order."""
 
-    def __init__(self, name: str | None, blocks: Sequence[PlannedBlock]) -> None:
-        self._before = sum(block.n for block in blocks[: [*(block.kind for block in blocks), _VIEWS].index(_VIEWS)])
-        self._name, self._phase = name, NO_SCAN
-        self.begin(None)
-        self._ends = np.cumsum([block.n for block in blocks])
-        self._kinds = [*(block.kind for block in blocks), None]
-
-    def begin(self, first_id: int | None) -> None:
-        """See `Guide`."""
-        self._first, self._last = math.nan if first_id is None else first_id - self._before, -1
+    def __init__(self, name: str | None) -> None:
+        self._name, self._is_told = name, False
 
     def __call__(self, frame: ArrayFrame) -> Phase:
         if self._name is None:
-            if math.isnan(self._first) or frame.unique_id < self._last:  # the first one, or numbers that began anew
-                self._first = frame.unique_id
-            self._last, n = frame.unique_id, frame.unique_id - self._first
-            i = int(np.searchsorted(self._ends, n, side="right"))
-            return Phase(i + 1, self._kinds[i]) if n >= 0 else NO_SCAN
-        if self._name not in frame.attributes:
+            return BY_ORDER
+        if self._name not in frame.attributes and not self._is_told:
             raise ConfigError(_lacking("kinds", self._name, frame))
-        kind = kind_of(frame.attributes[self._name])
-        if kind is not self._phase.kind:
-            self._phase = Phase(self._phase.serial + 1, kind)
-        return self._phase
+        word = frame.attributes.get(self._name)
+        if word is None or not str(word).strip():  # of a variable that is not connected for a while
+            return NOT_TOLD
+        self._is_told = True
+        return Phase(0, kind_of(word))
 
 
 def _lacking(key: str, name: str, frame: ArrayFrame) -> str:
@@ -120,8 +106,7 @@ class _ByNumbers:
         before = [PlannedBlock(kind, each.count) for kind, each in fields if each.count and each.at in _BEFORE]
         after = [PlannedBlock(kind, each.count) for kind, each in fields if each.count and each.at in _AFTER]
         self._blocks = (*before, PlannedBlock(FrameKind.PROJECTION, len(angles)), *after[::-1])
-        self._kinds = _Kinds(ride.kinds, self._blocks)
-        self.begin = self._kinds.begin
+        self._kinds = _Kinds(ride.kinds)
 
     def plan(self) -> RidePlan:
         seconds = {
@@ -232,7 +217,7 @@ class TomoscanGuide:
 
     def __init__(self, ride: RideSection, angles: TomoscanAngles, now: Callable[[], float] = time.time) -> None:
         self._ride, self._prefix = ride, angles.prefix
-        self._kinds = None if ride.kinds is None else _Kinds(ride.kinds, ())
+        self._kinds = None if ride.kinds is None else _Kinds(ride.kinds)
         self._variables = Variables(angles.prefix, _TOMOSCAN, _NEEDED, now)
         self._delay = math.inf  # of frames
         self._angles = np.empty(0)
@@ -240,9 +225,6 @@ class TomoscanGuide:
     @property
     def status(self) -> str:
         return self._variables.text("ScanStatus")
-
-    def begin(self, first_id: int | None) -> None:
-        pass
 
     def plan(self) -> RidePlan:
         number, text = self._variables.number, self._variables.text
@@ -278,7 +260,7 @@ class TomoscanGuide:
         if kind is None or self._kinds is None:
             return Phase(serial, kind)
         told = self._kinds(frame)
-        return Phase(serial * 1000 + told.serial, told.kind)
+        return Phase(serial, kind if told == NOT_TOLD else told.kind)
 
     def _collecting(self, seconds: float) -> tuple[int, FrameKind | None]:
         """The number of the status that said what is collected at this time of the camera's IOC, and of what kind."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from beamline.core.events import BlockDone, BlockStarted, StateEntered, Warned
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.core.text import count, spans
 from beamline.scan.control import State
-from beamline.scan.ledger import LedgerError
+from beamline.scan.ledger import EXTRA, LedgerError
 from beamline.scan.measurement import Measurement
 from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.arrays import ArrayFrame
@@ -25,15 +25,12 @@ from splatline_areadetector.config import RideConfig
 from splatline_areadetector.counters import Counters, Gap, Silence, losses_told
 from splatline_areadetector.guides import EXPOSURE, Guide
 from splatline_areadetector.plan import RidePlan
-from splatline_areadetector.sorter import NewEpoch, Outside, Place, Sorter
+from splatline_areadetector.sorter import Basis, Decision, NewEpoch, Outside, Place, Seen, Sorter, Unknown
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
 
 SLICE = 0.25  # s: the longest wait for a frame between two looks at the stop request
-SETTLES = 0.2  # s in which the camera's counter comes here, after the frame that it counts
-SECOND = 1.0  # s to wait for a second projection before the first is given its angle
+SECOND = 1.0  # s without a frame, after which those that wait for others have their places without them
 _STATES = {FrameKind.DARK: State.DARKS, FrameKind.FLAT: State.FLATS, FrameKind.PROJECTION: State.ACQUIRING}
-
-_OTHERS = " Every other frame is in the file with the angle of its number."
 
 Images = Mapping[FrameKind, NDArray[Any]]
 """Darks and flats [frame, row, col] from files, where the scan takes none."""
@@ -75,14 +72,19 @@ class RiddenFrames:
 
     recovered, unsafe = 0, False
 
-    def __init__(self, ride: Ride, plan: RidePlan, first_id: int | None, measurement: Measurement) -> None:
-        self._ride, self._plan, self._first_id, self._measurement = ride, plan, first_id, measurement
+    def __init__(
+        self, ride: Ride, plan: RidePlan, first_id: int | None, before: Seen | None, joined: bool,
+        measurement: Measurement,
+    ) -> None:  # fmt: skip
+        self._ride, self._plan, self._measurement = ride, plan, measurement
         self._stream, self._guide = ride.stream, ride.guide
         self._sink, self._stop = measurement.sink, measurement.stop
-        self._sorter = Sorter(plan.blocks, first_id)
+        self._sorter = Sorter(plan.blocks, first_id, ride.counters, before, joined=joined)
         self._gaps: list[Gap] = []
         self._overflowed: set[int] = set()
-        self._last: ArrayFrame | None = None
+        self._last: ArrayFrame | None = None  # that has a place
+        self._arrived: ArrayFrame | None = None  # the last one
+        self._unplaced: dict[str, list[int]] = {}
         self._block, self._block_kind, self._in_block = -1, "", 0
         self._gone = self._told_of_outside = False
         self._told_pause = self._epoch = ""
@@ -102,7 +104,11 @@ class RiddenFrames:
         """See `FrameSource`. LedgerError names the frames that are missing, and whose loss they are."""
         yield from self._from_files()
         yield from self._from_stream()
-        self._end_block()
+        yield from self._stored(self._sorter.decided(0))
+        for seen in reversed(self._sorter.held):
+            self._stream.put_back(seen.frame)
+        self._stream.first = self._last or self._stream.first
+        self._end_block(is_last=True)
         self._raise_outcome()
 
     def _from_files(self) -> Iterator[Frame]:
@@ -123,8 +129,10 @@ class RiddenFrames:
                     return
             match item:
                 case None:
-                    if self._guide.ended(math.inf) and self._silence.lasted > SECOND:
-                        return
+                    if self._silence.lasted > SECOND:
+                        yield from self._stored(self._sorter.decided(1))
+                        if self._guide.ended(math.inf):
+                            return
                     self._silence.look()
                 case Disconnected():
                     self._gone = True
@@ -133,6 +141,7 @@ class RiddenFrames:
                     self._warn(f"The process that receives frames has ended ({code}): another one is started.")
                 case Overflow(unique_id):
                     self._overflowed.add(unique_id)
+                    yield from self._stored(self._sorter.decided(1))
                     if (lost := self._sorter.pass_over(unique_id)) and self._last is not None:
                         self._gaps.append(Gap(lost, self._last.time, self._last.time))
                 case Refused(unique_id, why):
@@ -141,60 +150,96 @@ class RiddenFrames:
                         "the file."
                     )
                 case ArrayFrame():
-                    if item.is_current and (self._last is None or item.time <= self._last.time):
+                    if item.is_current and self._arrived is not None and item.time <= self._arrived.time:
                         continue  # the server still had it when it was connected
-                    if frame := self._placed(item):
-                        yield frame
-                        self._row += 1
+                    self._silence.frame_came()
+                    self._arrived, seen = item, seen_of(item, self._guide, gone=self._gone)
+                    self._gone = False
+                    yield from self._stored(self._sorter.take(seen))
                     if self._epoch or (self._in_block == 0 and self._guide.ended(item.time)):
                         return
+
+    def _stored(self, decided: Iterable[tuple[Seen, Decision]]) -> Iterator[Frame]:
+        """The frames of the file, until it ends."""
+        for seen, decision in decided:
+            if (frame := self._placed(seen, decision)) is not None:
+                yield frame
+                self._row += 1
+            if self._epoch or self._sorter.complete:
+                return
 
     def _warn(self, sentence: str) -> None:
         self._sink(Warned(sentence))
 
-    def _placed(self, frame: ArrayFrame) -> Frame | None:
+    def _placed(self, seen: Seen, place: Decision) -> Frame | None:
         """The frame of the file; None: it belongs to no scan, cannot be read, or to the next file."""
-        self._silence.frame_came()
-        place = self._place(frame)
+        frame: ArrayFrame = seen.frame
         if isinstance(place, NewEpoch):
-            self._epoch = place.why
-            self._warn(f"{place.why}: the file ends, another begins.")
-            self._stream.put_back(frame)
+            self._epoch = place.why or self._other_size(frame)
+            self._warn(f"{self._epoch}: the file ends, another begins.")
+            for each in (*reversed(self._sorter.held), seen):
+                self._stream.put_back(each.frame)
+            self._sorter.held.clear()
             return None
-        before, self._last, self._gone = self._last, frame, False
+        if isinstance(place, Unknown):
+            return self._unknown(frame, place)
+        before, self._last = self._last, frame
         if isinstance(place, Outside):
             if place.lost and before is not None:
                 self._add_gap(place.lost, before, frame)
-            self._end_block()
+            if not place.repeated:
+                self._end_block()
             if not (place.repeated or self._told_of_outside):
                 self._told_of_outside = True
                 self._sink(StateEntered(self._measurement.states.state, outside_sentence(self._guide)))
             return None
+        if place.note:
+            self._warn(place.note)
         if place.block != self._block:
-            place = self._begin_block(place, frame)
+            self._begin_block(place)
         if place.skipped and before is not None:
-            self._add_gap(range(frame.unique_id - len(place.skipped), frame.unique_id), before, frame)
-        try:
-            counts = frame.counts()
-        except ValueError as error:
+            self._add_gap(range(seen.number - len(place.skipped), seen.number), before, frame)
+        if (counts := self._counts(frame)) is None:
             self._sorter.lose(place)
-            self._warn(f"Frame {frame.unique_id}: {error}. It counts as missing.")
             return None
         return self._frame(frame, counts, place)
+
+    def _counts(self, frame: ArrayFrame) -> NDArray[np.uint16] | None:
+        try:
+            return frame.counts()
+        except ValueError as error:
+            self._warn(f"Frame {frame.unique_id}: {error}. It counts as missing.")
+        return None
+
+    def _unknown(self, frame: ArrayFrame, place: Unknown) -> Frame | None:
+        """A frame without a place, kept as an invalid row if it has the size of the others. It is said once of each
+        cause, and at the end of all."""
+        kept = "kept as an invalid row" if place.fits else "not stored"
+        frames = self._unplaced.setdefault(f"{place.why} ({kept})", [])
+        frames.append(frame.unique_id)
+        if len(frames) == 1:
+            self._warn(f"Frame {frame.unique_id} is {kept}: {place.why}.")
+        if not place.fits or (counts := self._counts(frame)) is None:
+            return None
+        self._in_block += bool(self._in_block)
+        return Frame(
+            counts, FrameKind.INVALID, self._row, EXTRA, frame.unique_id, math.nan, frame.time,
+            self._plan.exposure(FrameKind.PROJECTION),
+        )  # fmt: skip
 
     def _add_gap(self, ids: range, before: ArrayFrame, after: ArrayFrame) -> None:
         still = self._stream.stood_still(before.time, after.time)
         self._gaps.append(Gap(ids, before.time, after.time, still))
 
-    def _place(self, frame: ArrayFrame) -> Place | Outside | NewEpoch:
-        if self._last is not None and frame.kind != self._last.kind:
-            (before, dtype), (after, other) = self._last.kind, frame.kind
-            return NewEpoch(
-                f"frames are {after.shape[0]} x {after.shape[1]} {other} from number {frame.unique_id} on, after "
-                f"{before.shape[0]} x {before.shape[1]} {dtype}"
-                + ("" if (before.shape, dtype) != (after.shape, other) else ", of another part of the sensor")
-            )
-        return self._sorter.take(frame.unique_id, self._guide.phase(frame), reconnected=self._gone)
+    def _other_size(self, frame: ArrayFrame) -> str:
+        """Why the file ends at a frame of another size or type."""
+        assert self._last is not None
+        (before, dtype), (after, other) = self._last.kind, frame.kind
+        return (
+            f"frames are {after.shape[0]} x {after.shape[1]} {other} from number {frame.unique_id} on, after "
+            f"{before.shape[0]} x {before.shape[1]} {dtype}"
+            + ("" if (before.shape, dtype) != (after.shape, other) else ", of another part of the sensor")
+        )
 
     def _frame(self, frame: ArrayFrame, counts: NDArray[np.uint16], place: Place) -> Frame:
         kind, angle = place.kind, math.nan
@@ -210,48 +255,25 @@ class RiddenFrames:
         self._in_block += 1
         return Frame(counts, kind, self._row, place.trigger, frame.unique_id, angle, frame.time, seconds)
 
-    def _begin_block(self, place: Place, frame: ArrayFrame) -> Place:
+    def _begin_block(self, place: Place) -> None:
         self._end_block()
         self._block, kind = place.block, place.kind
-        if kind is FrameKind.PROJECTION and self._first_id is None and (lost := self._lost_before(frame)):
-            self._sorter.shift_first(lost)
-            place = Place(place.block, kind, place.trigger + lost, range(lost))
-            self._warn(f"The camera had counted {count(lost, 'projection')} before the first that came.")
         n = self._plan.blocks[place.block].n if place.block < len(self._plan.blocks) else 0
         self._block_kind = kind.name.lower()
         exposure, period = self._plan.exposure(kind), self._plan.period or 0.0
         self._sink(BlockStarted(self._block_kind, "ridden", n, self._row, exposure, period))
         self._measurement.states.enter(_STATES[kind])
-        return place
 
-    def _end_block(self) -> None:
+    def _end_block(self, *, is_last: bool = False) -> None:
         if not self._in_block:
             return
         planned = self._block < len(self._plan.blocks)
-        missing = self._sorter.missing(self._block) if planned else []
+        is_over = planned and (is_last or self._sorter.is_over(self._block))  # else it goes on after others
+        missing = self._sorter.missing(self._block) if is_over else []
         n = self._plan.blocks[self._block].n if planned else self._in_block
         first, lost = self._row - self._in_block, len(missing)
         self._sink(BlockDone(self._block_kind, "ridden", n, first, self._in_block, missing, lost, 0, 0))
-        self._in_block = 0
-
-    def _lost_before(self, frame: ArrayFrame) -> int:
-        """Projections that the camera had counted before this one, the first that came. It counts a frame about when it
-        sends it, so it is asked between the first and the second one."""
-        camera = self._ride.counters.camera
-        if camera is None:
-            return 0
-        second = self._stream.next(SECOND)
-        if second is not None:
-            self._stream.put_back(second)
-        time.sleep(SETTLES)
-        history, at = camera.histories["NumImagesCounter_RBV"], math.inf
-        if isinstance(second, ArrayFrame) and second.unique_id == frame.unique_id + 1:
-            at = frame.time + 0.7 * (second.time - frame.time)
-        elif second is not None:
-            return 0
-        values = history.until(at)
-        lost = int(float(values[-1])) - 1 if values else 0
-        return lost if 0 < lost < self._plan.angles.size else 0
+        self._in_block, self._block = 0, -1
 
     def _refuse_pause(self) -> None:
         reason = self._measurement.pause.reason
@@ -275,25 +297,30 @@ class RiddenFrames:
                     first, last = (math.degrees(angles[missing[end]]) for end in (0, -1))
                     at = f" (from {first:.4g}° to {last:.4g}°)"
                 words.append(f"{len(missing)} of {block.n} {noun}s are missing: {spans(missing)}{at}.")
-                if at and missing[0] == block.n - len(missing) and ended:
-                    words.append(self._first_or_last(missing))
+                if block.kind is FrameKind.PROJECTION and self._plan.told_by != "attribute":
+                    words.append(self._first_or_last(missing, ended))
         words += losses_told(self._gaps, self._overflowed, self._ride.counters)
         if self._sorter.repeats:
             words.append(f"{count(self._sorter.repeats, 'frame')} came twice and were stored once.")
+        words += [f"Frames {spans(sorted(ids))} have no place: {why}." for why, ids in self._unplaced.items()]
         return "".join(f" {sentence}" for sentence in words if sentence)
 
-    def _first_or_last(self, missing: Sequence[int]) -> str:
-        """A sentence on projections that are missing at the end, of a scan that ended: "" where their number is known.
+    def _first_or_last(self, missing: Sequence[int], ended: bool) -> str:
+        """A sentence on projections that are missing at the end: "" where the number of the first one is known, or
+        where a stop of a ride that waited for the first one tells why.
 
         No view shows it: the same turn of all angles gives the same views of a turned sample.
         """
-        if self._ride.counters.camera is not None or self._first_id is not None:
+        angles, basis = self._plan.angles, self._sorter.basis
+        n = next((i for i, trigger in enumerate(reversed(missing)) if trigger != angles.size - 1 - i), len(missing))
+        if n in (0, angles.size) or basis.is_sure or (basis is Basis.WAITED and not ended):
             return ""
-        angles, n = self._plan.angles, len(missing)
+        off = (
+            f"{math.degrees(angles[n] - angles[0]):.4g}° more" if not np.isnan(angles).any() else f"those of {n} later"
+        )
         return (
             f"As nothing tells the number of the first one, it may be the first {n} that are missing: then all angles "
-            f"are {math.degrees(angles[n] - angles[0]):.4g}° more, by which the volume is turned, and nothing else. "
-            "ride.camera or ride.first_id tells it."
+            f"are {off}, by which the volume is turned, and nothing else. ride.camera or ride.first_id tells it."
         )
 
     def _raise_outcome(self) -> None:
@@ -307,6 +334,21 @@ class RiddenFrames:
                 f"far as it goes.{told}"
             )
         if self._epoch:
-            raise EpochEndedError(f"{told.strip()} The file ends there, as {self._epoch}.{_OTHERS}", self.missing)
+            raise EpochEndedError(f"{told.strip()} The file ends there, as {self._epoch}.{self._others}", self.missing)
         if self.missing:
-            raise LedgerError(f"{told.strip()}{_OTHERS}", self.missing)
+            raise LedgerError(f"{told.strip()}{self._others}", self.missing)
+
+    @property
+    def _others(self) -> str:
+        by = "" if self._sorter.basis.is_sure else f", counted from {self._sorter.basis.value}"
+        return f" Every other frame is in the file with the angle of its number{by}."
+
+
+def seen_of(frame: ArrayFrame, guide: Guide, *, gone: bool = False) -> Seen:
+    """What is known of a frame.
+
+    Args:
+        gone: the server had gone since the frame before.
+    """
+    is_new = gone or frame.is_current
+    return Seen(frame.unique_id, guide.phase(frame), frame.time, frame.kind, frame.payload, is_new, frame)

@@ -22,7 +22,17 @@ from splatline_areadetector.config import RideConfig, TomoscanAngles
 from splatline_areadetector.counters import Counters, Silence, refuse_mistakes
 from splatline_areadetector.guides import EXPOSURE, Guide, guide_of
 from splatline_areadetector.plan import PlannedBlock, RidePlan, ready_of
-from splatline_areadetector.ridden import SLICE, EpochEndedError, Images, RiddenFrames, Ride, outside_sentence
+from splatline_areadetector.ridden import (
+    SECOND,
+    SLICE,
+    EpochEndedError,
+    Images,
+    RiddenFrames,
+    Ride,
+    outside_sentence,
+    seen_of,
+)
+from splatline_areadetector.sorter import BY_ORDER, NOT_TOLD, Seen, n_before_views, not_set
 from splatline_areadetector.stream import FrameStream, Refused
 
 
@@ -37,13 +47,12 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
     config, lost = ride.config.as_scan, None
     first_id = ride.config.ride.first_id
     while True:
-        ride.guide.begin(first_id)
-        first = wait_for_scan(ride, first_id)
+        first, before = wait_for_scan(ride, first_id, joined=lost is not None)
         refuse_mistakes(ride.config, ride.counters, first)
         own = _with_exposure(ride.guide.plan(), ride, first)
         plan = _with_given(own, ride.given, first.window.shape)
         ready = ready_of(ride.config, plan, first, ride.runs)
-        source_of = partial(RiddenFrames, ride, own, first_id)
+        source_of = partial(RiddenFrames, ride, own, first_id, before, lost is not None)
         try:
             result = record_scan(
                 config, ready, source_of, ride.runs, sinks, ride.stop, live=live and ride.config.recon.live
@@ -56,8 +65,11 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
         return result
 
 
-def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
-    """The first frame of a scan, which the stream still has; those before it are dropped.
+def wait_for_scan(ride: Ride, first_id: int | None, *, joined: bool) -> tuple[ArrayFrame, Seen | None]:
+    """The first frame of a scan, which the stream still has, and the one before it; those before it are dropped.
+
+    Args:
+        joined: a file has ended within the scan.
 
     Raises:
         ScanAborted: a stop was requested.
@@ -66,7 +78,10 @@ def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
     """
     stream, guide = ride.stream, ride.guide
     silence = Silence(stream, ride.counters, ride.config.ride.silence_s, ride.say, lambda: "Nothing was recorded.")
-    told = False
+    told, known = False, stream.first
+    before = None if known is None else Seen(known.unique_id, BY_ORDER, known.time)
+    if joined and known is not None:
+        before = seen_of(known, guide)
     ride.say(f"Waiting for the first frame of a scan from {stream.name}{_shown(ride)}")
     while not ride.stop.stopping:
         item = stream.next(SLICE)
@@ -76,16 +91,38 @@ def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
             silence.look()
             continue
         silence.frame_came()
-        if item.is_current:  # it was there before
+        if item.is_current and known is not None and item.time <= known.time:  # it was there before
             continue
-        kind = guide.phase(item).kind
-        if kind is not None and not (kind is FrameKind.PROJECTION and item.unique_id < (first_id or 0)):
-            stream.put_back(item)
-            return item
+        seen = seen_of(item, guide)
+        if _begins(seen, ride, first_id):
+            if not _is_alone(item, ride):
+                stream.put_back(item)
+                return item, before
+            continue
+        before = before if seen.phase == NOT_TOLD else seen
         if not told:
             told = True
             ride.say(outside_sentence(guide))
     raise ScanAborted(f"Interrupted before the first frame: {ride.stop.reason}. Nothing was recorded.")
+
+
+def _begins(seen: Seen, ride: Ride, first_id: int | None) -> bool:
+    """Whether it is a frame of the scan."""
+    if seen.phase == BY_ORDER:
+        return first_id is None or seen.number >= first_id - n_before_views(ride.guide.plan().blocks)
+    kind = seen.phase.kind
+    return kind is not None and (kind is not FrameKind.PROJECTION or seen.number >= (first_id or seen.number))
+
+
+def _is_alone(first: ArrayFrame, ride: Ride) -> bool:
+    """Whether the next frames are of another size. ConfigError: their numbers are the same, and their pixels differ."""
+    ahead = [each for each in ride.stream.ahead(2, SECOND) if isinstance(each, ArrayFrame)]
+    if ahead and ahead[0].unique_id == first.unique_id and not np.array_equal(ahead[0].payload, first.payload):
+        raise ConfigError(f"{not_set(first.unique_id)}. Nothing was recorded.")
+    if len(ahead) < 2 or first.kind == ahead[0].kind or ahead[0].kind != ahead[1].kind:
+        return False
+    ride.say(f"Frame {first.unique_id} is of another size than those after it: it is not stored.")
+    return True
 
 
 def _shown(ride: Ride) -> str:

@@ -1,17 +1,38 @@
-"""Sorter: by their numbers, which trigger of the plan each frame belongs to, what is missing, and where a file ends.
+"""Sorter: which dark, flat or projection each frame is, from all that is known of it, and what that rests on.
 
-A frame's trigger is its uniqueId less that of the first frame of its block. Frames beyond a block's plan belong to no
-scan: cameras run free before and after. A number that falls begins another epoch, unless the kind of frames changed
-with it: cameras may count from each start of an acquisition. All of it is arithmetic on numbers; no frame is touched.
+Known are a frame's number, size, kind, pixels and time, the counts of the plan's blocks, and the camera's own counter.
+A frame's trigger is its number less that of the first frame of its block. The number is believed as far as it goes:
+
+- Neighbours may be exchanged: a frame whose number is ahead waits until some more have come.
+- A counter of 16 or 32 bits begins again at its end, and the count goes on.
+- A plugin that averages n frames passes on each nth number.
+- Numbers may begin anew with each acquisition: after a whole block the next one begins. Within a block the file ends.
+
+It is arithmetic on values: no file, no server, no clock.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import math
+from bisect import insort
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from itertools import pairwise
+from typing import Any, Protocol
 
+import numpy as np
+
+from beamline.core.errors import DataError
 from drivers.base.frame import FrameKind
 from splatline_areadetector.plan import PlannedBlock
+
+VIEW = FrameKind.PROJECTION
+WINDOW = 4  # frames that come before one with a lower number, at most
+_NEAR = 100  # numbers from the end of a counter's range within which it may begin again
+_RANGES = ((0, 2**16 - 1), (0, 2**31 - 1), (-(2**31), 2**31 - 1))
+_RUNNING = 3  # periods between two frames of the same acquisition, at most
 
 
 @dataclass(frozen=True)
@@ -19,7 +40,7 @@ class Phase:
     """What a scan does while a frame is taken.
 
     Attributes:
-        serial: another one is another block, even of the same kind.
+        serial: another one is another block of darks or flats, even of the same kind.
         kind: None: the frame belongs to no scan.
     """
 
@@ -27,19 +48,86 @@ class Phase:
     kind: FrameKind | None
 
 
+NO_SCAN, BY_ORDER, NOT_TOLD = (Phase(serial, None) for serial in (0, -1, -2))
+"""A frame of no scan; one whose kind follows from the order of the plan's blocks; one whose kind nothing tells."""
 UNPLANNED = 2**31
 """Frames at most of a block that the plan does not have: darks and flats that come all the same."""
-NO_SCAN = Phase(0, None)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What is known of a frame.
+
+    Attributes:
+        time: s, by the IOC.
+        size: whatever all frames of a file have in common.
+        pixels: compared with those of a frame of the same number.
+        reconnected: the server had gone since the frame before, or came with this one when it was asked.
+        frame: goes with it.
+        era: how often the numbers had begun anew; the sorter sets it.
+    """
+
+    number: int
+    phase: Phase
+    time: float = math.nan
+    size: Any = None
+    pixels: Any = None
+    reconnected: bool = False
+    frame: Any = None
+    era: int = 0
+
+    def repeats(self, other: Seen, *, is_last: bool) -> bool:
+        """Whether it is the same frame as one of its number, sent once more: at once, or later with the same time."""
+        is_same = self.phase == other.phase and (is_last or self.time == other.time)
+        return is_same and np.array_equal(self.pixels, other.pixels)
+
+
+class Basis(Enum):
+    """What the number of a block's first frame rests on, as a sentence's end."""
+
+    GIVEN = "as ride.first_id says"
+    NUMBERS = "as its number follows that of the frame before the block"
+    COUNTER = "as the camera's own count says"
+    WHOLE = "as the block before is whole, and lost numbers after it are this block's"
+    WAITED = "the first that came"
+    UNKNOWN = "the first that came, although others may have come before it"
+
+    @property
+    def is_sure(self) -> bool:
+        return self not in (Basis.WAITED, Basis.UNKNOWN)
+
+
+class Witness(Protocol):
+    """What the IOC's own counters say."""
+
+    def counted(self, first: float, second: float | None) -> int | None:
+        """Frames of the acquisition that the camera had counted with its frame of this time; None: not known.
+
+        Args:
+            second: time of the next frame; None: not known.
+        """
+
+    def were_lost(self, begin: float, end: float, n: int) -> bool:
+        """Whether the plugin tells that more than n frames passed in this time."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """A frame's place in the plan: its block, and its trigger within it; `skipped`: triggers lost just before."""
+    """A frame's place in the plan.
+
+    Attributes:
+        trigger: within its block.
+        skipped: triggers lost just before.
+        basis: what the number of the block's first frame rests on.
+        note: a sentence on what had to be assumed; "": nothing.
+    """
 
     block: int
     kind: FrameKind
     trigger: int
     skipped: range = range(0)
+    basis: Basis = Basis.WAITED
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -52,115 +140,357 @@ class Outside:
 
 
 @dataclass(frozen=True)
+class Unknown:
+    """A frame of the scan that has no place; `why`: a sentence's end. `fits`: whether it has the size of the others."""
+
+    why: str
+    fits: bool = True
+
+
+@dataclass(frozen=True)
 class NewEpoch:
     """The file ends before this frame; `why`: a sentence without a full stop."""
 
     why: str
 
 
+Decision = Place | Outside | Unknown | NewEpoch
+
+
 @dataclass
 class _Taken:
-    """A block and the triggers that came."""
+    """A block and the triggers that came; `away`: the first frame of another kind after its last one."""
 
     kind: FrameKind
     n: int
-    first_id: int
-    last_id: int
+    first: int
+    step: int
+    last: int
+    era: int
+    basis: Basis
     triggers: set[int] = field(default_factory=set)
+    closed: bool = False
+    away: Seen | None = None
+
+    def trigger(self, number: int) -> int:
+        return (number - self.first) // self.step
+
+    @property
+    def end(self) -> int:
+        """Number of the first frame beyond the plan."""
+        return self.first + self.n * self.step
 
     @property
     def is_over(self) -> bool:
-        return self.last_id - self.first_id + 1 >= self.n
+        return self.closed or self.last >= self.end - self.step
+
+
+def not_set(number: int) -> str:
+    """A sentence on numbers that stay the same."""
+    return (
+        f"uniqueId is not set: it stays at {number} while the pixels change, and a ride knows a frame by it. Have the "
+        "server set uniqueId of its NTNDArray to the count of frames"
+    )
+
+
+def n_before_views(blocks: Sequence[PlannedBlock]) -> int:
+    """Frames that are planned before the projections."""
+    return sum(block.n for block in blocks[: [*(block.kind for block in blocks), VIEW].index(VIEW)])
 
 
 class Sorter:
-    """Assigns frames to the plan's blocks, in the order in which they come.
+    """Assigns frames to the plan's blocks.
 
     Args:
         blocks: planned.
-        first_id: number of the first projection; None: that of the first one that comes.
+        first_id: number of the first projection; None: it follows from what is known.
+        witness: counters of the IOC; None: it has none.
+        before: the last frame before the first one.
+        joined: the scan may have begun before: its numbers began anew within it.
 
     Attributes:
         repeats: frames that came twice.
+        held: frames that wait for others, in the order of their numbers.
     """
 
-    def __init__(self, blocks: Sequence[PlannedBlock], first_id: int | None = None) -> None:
-        self._planned, self._first_id = tuple(blocks), first_id
+    def __init__(
+        self, blocks: Sequence[PlannedBlock], first_id: int | None = None, witness: Witness | None = None,
+        before: Seen | None = None, *, joined: bool = False,
+    ) -> None:  # fmt: skip
+        self._planned, self._first_id, self._witness, self._joined = tuple(blocks), first_id, witness, joined
         self._taken: dict[int, _Taken] = {}  # by the number of the planned block; extra ones follow
-        self._now, self._serial, self._closed, self._fell = -1, -1, False, False
+        self._now, self._serial, self._step = -1, 0, 0  # a step of 0 is not known yet
+        self._raw = None if before is None else before.number  # the last number as it came
+        self._turned = self._turn = 0
+        self._last = self._known = before
+        self._recent = deque[Seen](maxlen=WINDOW)
+        self._size: Any = None
+        self._note = ""
+        self.held: list[Seen] = []
         self.repeats = 0
 
-    def take(self, unique_id: int, phase: Phase, *, reconnected: bool = False) -> Place | Outside | NewEpoch:
-        """Where the next frame belongs.
+    def take(self, seen: Seen) -> Iterator[tuple[Seen, Decision]]:
+        """Take the next frame. Where each frame that waits no longer belongs, in the order of their numbers: see
+        `decided`."""
+        newest = self.held[-1] if self.held else self._last
+        number = self._unwrapped(seen.number, is_anew=seen.reconnected)
+        era = 0 if newest is None else newest.era
+        same = [each for each in (*self._recent, *self.held) if (each.number, each.era) == (number, era)]
+        if same and not seen.reconnected and seen.repeats(same[-1], is_last=same[-1] is newest):
+            self.repeats += 1
+            yield replace(seen, number=number), Outside(repeated=True)
+            return
+        if newest is not None and number <= newest.number:
+            era = self._era_of(seen, number, newest) + bool(same)
+        insort(self.held, replace(seen, number=number, era=era), key=lambda each: (each.era, each.number))
+        yield from self.decided(2)
+
+    def _era_of(self, seen: Seen, number: int, newest: Seen) -> int:
+        """The era of a frame whose number is not beyond that of the newest one: exchanged, or numbered anew."""
+        last, step = self._last, self._step or 1
+        one_before = [each.number for each in self.held[:-1] if each.era == newest.era]
+        if seen.reconnected:
+            return newest.era + 1
+        if last is not None and last.era == newest.era:
+            return newest.era + (number <= last.number or number < newest.number - WINDOW * step)
+        if last is not None and len(self.held) == 1 and seen.phase == last.phase != newest.phase:
+            return newest.era - (number == last.number + step)
+        if one_before:
+            return newest.era + (number <= one_before[-1])
+        return newest.era + (seen.phase != newest.phase or number < newest.number - step)
+
+    def decided(self, patience: int) -> Iterator[tuple[Seen, Decision]]:
+        """Where each frame that waits no longer belongs.
 
         Args:
-            reconnected: the server had gone since the frame before.
+            patience: 2: more frames are coming; 1: none has come for a while; 0: none will come.
+
+        Raises:
+            DataError: numbers tell nothing, as all are the same.
         """
-        current = self._taken.get(self._now)
-        fell = False
-        if current is not None and unique_id < current.last_id:
-            fell = self._fell = True
-            if reconnected or (phase.serial == self._serial and not (self._closed or current.is_over)):
-                return NewEpoch(
-                    f"frame numbers began anew at {unique_id}, after {current.last_id}: the server restarted, or its "
-                    "counter was reset"
-                )
-        if phase.kind is None:
-            return self._outside(unique_id)
-        if phase.serial != self._serial or current is None:
-            return self._begin(unique_id, phase)
-        trigger = unique_id - current.first_id
-        if fell or self._closed or trigger >= current.n:
-            self._closed = self._closed or fell
-            return self._outside(unique_id)
-        if unique_id == current.last_id:
-            self.repeats += 1
-            return Outside(repeated=True)
-        skipped = range(current.last_id + 1 - current.first_id, trigger)
-        current.last_id = unique_id
-        current.triggers.add(trigger)
-        return Place(self._now, current.kind, trigger, skipped)
+        while self.held and not (len(self.held) <= WINDOW and self._waits(patience)):
+            seen = self.held.pop(0)
+            yield seen, self._decide(seen, patience)
 
-    def _outside(self, unique_id: int) -> Outside:
+    def _waits(self, patience: int) -> bool:
+        """Whether the first of the frames that are held is not decided before others have come."""
+        seen, last = self.held[0], self._last
+        if self._size not in (None, seen.size):
+            return patience > 0 and all(each.size != self._size for each in self.held)
+        goes_on = last is not None and seen.era == last.era and bool(self._taken)
+        if goes_on and last is not None and seen.number <= last.number + max(self._step, 1):
+            return False
+        return patience > 1 or (patience == 1 and goes_on and self._step == 0 and len(self.held) < 2)
+
+    def _decide(self, seen: Seen, patience: int) -> Decision:
+        last, block = self._last, self._taken.get(self._now)
+        if self._size not in (None, seen.size):
+            is_alone = not patience or any(each.size == self._size for each in self.held)
+            return Unknown("it has another size than the others", fits=False) if is_alone else NewEpoch("")
+        is_anew = last is not None and seen.era != last.era
+        if last is not None and block is not None:
+            if (is_anew or self._is_another_count(seen, last)) and (why := self._new_epoch(seen, last, block)):
+                return NewEpoch(why)
+            if not (is_anew or self._step):
+                self._learn_step(seen, last, block)
+        place = self._place(seen, block, is_anew)
+        self._size, self._last = seen.size, seen
+        self._recent.append(seen)
+        if isinstance(place, Unknown):
+            return place
+        self._known, views = self._known if seen.phase == NOT_TOLD else seen, self._views
+        if views is not None and not (isinstance(place, Place) and self._taken[place.block] is views):
+            views.away = views.away or seen
+        if isinstance(place, Place):
+            place, self._note = replace(place, note=self._note), ""
+        return place
+
+    def _is_another_count(self, seen: Seen, last: Seen) -> bool:
+        """Whether a number that rose while the server had gone rose by far more or less than the time did."""
+        if not seen.reconnected or seen.era != self._recent[0].era or last.number == self._recent[0].number:
+            return False
+        period = (last.time - self._recent[0].time) / (last.number - self._recent[0].number)
+        expected = (seen.number - last.number) * period
+        return not expected / 2 <= seen.time - last.time <= 2 * expected + 2 * period
+
+    def _new_epoch(self, seen: Seen, last: Seen, block: _Taken) -> str:
+        """Why the file ends, where numbers have begun anew; "": another block begins, or none."""
+        if seen.number == last.number and not (seen.reconnected or block.is_over):
+            raise DataError(f"{not_set(seen.number)}. What came before is in the file.")
+        is_same = seen.phase in (BY_ORDER, NOT_TOLD) or (
+            seen.phase.kind is block.kind and (block.kind is VIEW or seen.phase.serial == self._serial)
+        )
+        if not seen.reconnected and (block.is_over or not is_same):
+            return ""
+        return (
+            f"frame numbers began anew at {seen.number}, after {last.number}: the server restarted, or its counter was "
+            "reset"
+        )
+
+    def _learn_step(self, seen: Seen, last: Seen, block: _Taken) -> None:
+        """By how much numbers rise from frame to frame: by more than 1 where all of some do, and none was lost."""
+        following = [last, seen, *self.held]
+        rises = [b.number - a.number for a, b in pairwise(following) if a.era == b.era]
+        step = math.gcd(*rises)
+        if len(rises) < 2 and step > 1:
+            return
+        lost = self._witness is not None and self._witness.were_lost(last.time, following[-1].time, len(rises))
+        self._step = block.step = 1 if lost else step
+        if self._step > 1:
+            self._note = (
+                f"The numbers of frames rise by {step}: a plugin averages {step} frames, or passes on each {step}th. "
+                "Each that comes is taken for a frame of the plan. If the plan counts the camera's frames, take the "
+                "image before that plugin (NDArrayPort)."
+            )
+
+    def _place(self, seen: Seen, block: _Taken | None, is_anew: bool) -> Decision:
+        """Where a frame belongs that begins no file."""
+        kind, views = seen.phase.kind, self._views
+        if seen.phase == NOT_TOLD:
+            if block is None or is_anew or block.closed or seen.number >= block.end:
+                return Unknown("nothing tells whether it is a dark, a flat or a projection")
+        elif seen.phase == BY_ORDER:
+            self._by_order(seen, block, is_anew)
+        elif kind is None:
+            return self._outside(seen, block)
+        elif kind is VIEW and views is not None:
+            if not views.is_over and views.away is not None:
+                self._go_on(seen, views, views.away)
+        elif block is None or kind is not block.kind or seen.phase.serial != self._serial:
+            self._begin(seen, kind, is_anew)
+        block = self._taken.get(self._now)
+        if block is None or kind not in (None, block.kind) or seen.number < block.first:
+            return Outside()
+        trigger, rest = divmod(seen.number - block.first, block.step)
+        if block.closed or seen.era != block.era or trigger >= block.n:
+            return self._outside(seen, block)
+        if rest:
+            return Unknown(f"numbers rise by {block.step}, and its own is none of them")
+        skipped, block.last = range(block.trigger(block.last) + 1, trigger), seen.number
+        block.triggers.add(trigger)
+        if seen.reconnected and not self._note and len(block.triggers) > 1:
+            self._note = f"The server had gone before frame {seen.number}: it is placed as if the count had gone on."
+        return Place(self._now, block.kind, trigger, skipped, block.basis)
+
+    def _outside(self, seen: Seen, block: _Taken | None) -> Outside:
         """A frame that is not stored. By its number the present block may be over, whatever is missing at its end."""
-        current = self._taken.get(self._now)
-        if current is None or self._closed or unique_id < current.first_id + current.n:
+        if block is None or block.closed or seen.number < block.end:
             return Outside()
-        end, self._closed = current.first_id + current.n, True
-        lost = range(0) if self._fell else range(current.last_id + 1, end)
-        current.last_id = end - 1
-        return Outside(lost=lost)
+        block.closed = True
+        return Outside(lost=range(block.last + block.step, block.end if seen.era == block.era else 0, block.step))
 
-    def _begin(self, unique_id: int, phase: Phase) -> Place | Outside:
-        kind, first = phase.kind, unique_id
-        assert kind is not None
-        if kind is FrameKind.PROJECTION and self._first_id is not None:
-            if unique_id < self._first_id:
-                return Outside()
-            first = self._first_id
-        n = next((block.n for block in self._planned if block.kind is kind), UNPLANNED)
-        trigger = unique_id - first
-        self._serial, self._closed, self._fell = phase.serial, trigger >= n, False
-        if self._closed:
-            return Outside()
-        free = (i for i, block in enumerate(self._planned) if block.kind is kind and i not in self._taken)
-        self._now = next(free, max([len(self._planned) - 1, *self._taken]) + 1)
-        self._taken[self._now] = _Taken(kind, n, first, unique_id, {trigger})
-        return Place(self._now, kind, trigger, range(trigger))
+    def _by_order(self, seen: Seen, block: _Taken | None, is_anew: bool) -> None:
+        """Open the planned block that follows from the order of blocks and their counts."""
+        i, step = self._now, self._step or 1
+        if block is not None and not is_anew:
+            first, basis = block.first, block.basis
+        elif self._first_id is not None and block is None:
+            i, first, basis = 0, self._first_id - n_before_views(self._planned) * step, Basis.GIVEN
+        else:
+            i += 1
+            lost, basis = self._lost_before(seen, is_anew, self._planned[i].n if i < len(self._planned) else 0)
+            first = seen.number - lost * step
+        while i < len(self._planned) and seen.number >= first:
+            if i != self._now:
+                self._open(i, self._planned[i], first, seen, basis)
+            first, i = first + self._planned[i].n * step, i + 1
 
-    def shift_first(self, steps: int) -> None:
-        """So many frames of the present block came before its first one and were lost."""
-        current = self._taken[self._now]
-        current.first_id -= steps
-        current.triggers = {trigger + steps for trigger in current.triggers}
+    def _begin(self, seen: Seen, kind: FrameKind, is_anew: bool) -> None:
+        """Open the block that begins with a frame of another kind, or with other darks or flats."""
+        views, lost, basis = self._views, 0, Basis.WAITED
+        if views is not None and not views.is_over:  # within the projections, or at their end, some of which are lost
+            n_left = views.n - 1 - views.trigger(views.last)
+            views.closed = seen.number >= views.end if seen.era == views.era else n_left <= WINDOW
+        is_later = views is None or views.is_over
+        planned = [(i, each) for i, each in enumerate(self._planned) if each.kind is kind]
+        free = [i for i, _ in planned if i not in self._taken and (is_later or VIEW in self._kinds(i))]
+        n = planned[0][1].n if planned else UNPLANNED
+        if kind is VIEW and self._first_id is not None:
+            lost, basis = (seen.number - self._first_id) // (self._step or 1), Basis.GIVEN
+        elif kind is VIEW:
+            lost, basis = self._lost_before(seen, is_anew, n)
+        if lost >= 0:
+            i = free[0] if free else max(len(self._planned) - 1, *self._taken, -1) + 1
+            self._open(i, PlannedBlock(kind, n), seen.number - lost * (self._step or 1), seen, basis)
 
-    def pass_over(self, unique_id: int) -> range:
+    def _kinds(self, after: int) -> list[FrameKind]:
+        return [each.kind for each in self._planned[after:]]
+
+    def _open(self, i: int, block: PlannedBlock, first: int, seen: Seen, basis: Basis) -> None:
+        step = self._step or 1
+        if (before := self._taken.get(self._now)) is not None and i < len(self._planned):
+            before.closed = True
+        self._now, self._serial = i, seen.phase.serial
+        self._taken[i] = _Taken(block.kind, block.n, first, step, first - step, seen.era, basis)
+
+    def _lost_before(self, seen: Seen, is_anew: bool, n: int) -> tuple[int, Basis]:
+        """Frames of a block of n that were lost before the first that came, and what tells it."""
+        known, step = self._known, self._step or 1
+        second = next((each for each in self.held if each.era == seen.era), None)
+        gap, is_other = n, known is not None and known.phase != BY_ORDER and known.phase.kind is not seen.phase.kind
+        if known is not None and is_other and known.era == seen.era and not seen.reconnected:
+            gap = (seen.number - known.number) // step - 1  # from n on it is another count
+        if gap == 0:
+            return 0, Basis.NUMBERS
+        if self._witness is not None and (second is None or second.number == seen.number + step):
+            counted = self._witness.counted(seen.time, None if second is None else second.time)
+            lost = -1 if counted is None else counted // step - 1
+            if 0 <= lost < n and lost <= gap:
+                words = "1 projection" if lost == 1 else f"{lost} projections"
+                self._note = f"The camera had counted {words} before the first that came." if lost else self._note
+                return lost, Basis.COUNTER
+        block = self._taken.get(self._now)
+        if gap < n and known is not None and block is not None and known.number == block.last == block.end - step:
+            lost = gap - sum(each.n for each in self._planned[self._now + 1 : self._kinds(0).index(VIEW)])
+            if 0 <= lost < n:
+                self._note = f"Frames just before {seen.number} were lost: {lost} are taken for the first projections."
+                return lost, Basis.WHOLE
+        is_late = self._joined or seen.reconnected or gap < n or (is_anew and seen.number > 1)
+        if not (is_late or is_anew or is_other) and known is not None and second is not None:
+            is_late = seen.time - known.time <= _RUNNING * (second.time - seen.time)
+        if is_late:
+            self._note = (
+                f"Nothing tells whether frame {seen.number} is the first projection of the scan, as frames came before "
+                "it, or may have. It is taken for the first. If others were before it, all angles are off by as many "
+                "steps. ride.camera or ride.first_id tells it."
+            )
+        return 0, Basis.UNKNOWN if is_late else Basis.WAITED
+
+    def _go_on(self, seen: Seen, views: _Taken, away: Seen) -> None:
+        """The projections go on after frames of another kind, which are none of their triggers."""
+        lost, known = 0, self._known
+        if known is not None and seen.era == known.era == away.era == views.era:
+            lost = views.trigger(away.number) - views.trigger(views.last) - 1
+            lost += (seen.number - known.number) // views.step - 1
+        trigger = views.trigger(views.last) + 1 + lost
+        self._note = f"Other frames came within the projections, which go on with {trigger} at number {seen.number}" + (
+            f", as {lost} were lost before and after those." if lost else "."
+        )
+        views.first, views.era, views.away = seen.number - trigger * views.step, seen.era, None
+        views.last = seen.number - (lost + 1) * views.step
+        self._now = next(i for i, each in self._taken.items() if each is views)
+
+    def _unwrapped(self, raw: int, *, is_anew: bool = False) -> int:
+        """A number that goes on where a counter of 16 or 32 bits has begun again at its end."""
+        last, self._raw = raw if self._raw is None else self._raw, raw
+        for low, top in _RANGES:
+            if top - _NEAR <= last <= top and low <= raw <= low + _NEAR and not is_anew:
+                self._turned = top - low + (low != 0 or raw == 0)  # cameras of GigE Vision leave out 0
+                self._turn += self._turned
+                if last < top or raw > low + 1:
+                    self._note = f"Numbers went from {last} to {raw}: as if the counter had gone on beyond {top}."
+            elif self._turned and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
+                self._raw = last  # exchanged with its neighbour
+                return raw + self._turn - self._turned
+        return raw + self._turn
+
+    def pass_over(self, raw: int) -> range:
         """Frames up to this number of the present block will not come; the numbers of those that had not come yet."""
-        current = self._taken.get(self._now)
-        if current is None or self._closed or not current.last_id < unique_id < current.first_id + current.n:
+        block, number = self._taken.get(self._now), self._unwrapped(raw)
+        if block is None or block.closed or not block.last < number < block.end:
             return range(0)
-        lost = range(current.last_id + 1, unique_id + 1)
-        current.last_id = unique_id
+        lost, block.last = range(block.last + block.step, number + 1, block.step), number
+        self._last = None if self._last is None else replace(self._last, number=number)
         return lost
 
     def lose(self, place: Place) -> None:
@@ -168,9 +498,24 @@ class Sorter:
         self._taken[place.block].triggers.discard(place.trigger)
 
     @property
+    def _views(self) -> _Taken | None:
+        return next((each for each in self._taken.values() if each.kind is VIEW), None)
+
+    @property
+    def basis(self) -> Basis:
+        """What the number of the first projection rests on."""
+        return Basis.WAITED if self._views is None else self._views.basis
+
+    @property
     def complete(self) -> bool:
-        """Whether every planned block has begun and the present one is over, so that no more frames are expected."""
-        return all(i in self._taken for i in range(len(self._planned))) and self._taken[self._now].is_over
+        """Whether every planned block has begun, and the present one and the projections are over, so that no more
+        frames are expected."""
+        begun = all(i in self._taken for i in range(len(self._planned)))
+        return begun and self._taken[self._now].is_over and (self._views is None or self._views.is_over)
+
+    def is_over(self, block: int) -> bool:
+        """Whether no more frames of a block are expected."""
+        return self._taken[block].is_over
 
     def missing(self, block: int) -> list[int]:
         """Triggers of a planned block that gave no frame."""

@@ -108,7 +108,7 @@ class FrameStream:
 
     Attributes:
         name: of the process variable.
-        first: the frame that the server had when it was asked; None: it had none yet.
+        first: the frame that the server had when it was asked, later the last one of a ride; None: it had none yet.
         queue: frames that the server was asked to hold.
         still: intervals of the Unix time during which no frame could be received.
 
@@ -153,6 +153,15 @@ class FrameStream:
                 return None
             self._changed.notify_all()
             return self._items.popleft()
+
+    def ahead(self, n: int, timeout: float) -> list[Item]:
+        """The next items, at most n of them, which `next` still returns. Waits for each."""
+        items = list[Item]()
+        while len(items) < n and (item := self.next(timeout)) is not None:
+            items.append(item)
+        for item in reversed(items):
+            self.put_back(item)
+        return items
 
     def put_back(self, item: Item) -> None:
         """Have `next` return this item again, before all others."""

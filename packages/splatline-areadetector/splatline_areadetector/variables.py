@@ -75,6 +75,18 @@ class History:
             return None
         return max(0.0, after - before)
 
+    def risen(self, end: float, rest: float) -> float | None:
+        """By how much a counter had risen at a time of its IOC since it last fell (to 0), or stood still for `rest` s;
+        None: it has risen ever since it is known."""
+        n = bisect_right(self._stamps, end)
+        values = [float(value) for value in self._values[:n]]
+        for i in range(n - 1, 0, -1):
+            if values[i] < values[i - 1]:
+                return values[-1]
+            if values[i] > values[i - 1] and self._stamps[i] - self._stamps[i - 1] > rest:
+                return values[-1] - values[i - 1]
+        return None
+
     def until(self, seconds: float) -> Sequence[Value]:
         """The values that the IOC had set by then, oldest first; always the first one, which was there before us."""
         return self._values[: max(1, bisect_right(self._stamps, seconds))]

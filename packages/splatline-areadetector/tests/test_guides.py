@@ -20,7 +20,7 @@ from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import FrameKind
 from splatline_areadetector.arrays import ArrayFrame, array_frame
 from splatline_areadetector.guides import TomoscanGuide, guide_of, kind_of
-from splatline_areadetector.sorter import NO_SCAN, Phase
+from splatline_areadetector.sorter import BY_ORDER, NO_SCAN, NOT_TOLD, Phase
 from splatline_areadetector.variables import History, Variables, url_problem
 
 CLIENT = """
@@ -95,18 +95,17 @@ def test_tomoscans_kinds_although_its_clock_is_half_an_hour_off(tmp_path: Path) 
 
 
 def test_kinds_by_order_and_by_attribute(tmp_path: Path) -> None:
-    fields = {"darks": {"count": 2, "at": "both"}}
     angles = {"from": "attribute", "views": 3}
-    guide = guide_of(config_of(tmp_path, "pva://P:I", angles, **fields).ride)
-    kinds = [guide.phase(_frame(i, SampleRotary=1.0 * i)).kind for i in range(7, 15)]
-    assert kinds == [2, 2, 0, 0, 0, 2, 2, None]
+    guide = guide_of(config_of(tmp_path, "pva://P:I", angles, darks={"count": 2, "at": "both"}).ride)
+    assert [block.n for block in guide.plan().blocks] == [2, 3, 2]
+    assert guide.phase(_frame(7, SampleRotary=1.0)) == BY_ORDER
     assert guide.angle(_frame(9, SampleRotary=90.0), 0) == pytest.approx(math.pi / 2)
     with pytest.raises(ConfigError, match="SampleRotary, an attribute that the frames do not have; they have ColorM"):
         guide.phase(_frame(9))
     guide = guide_of(config_of(tmp_path, "pva://P:I", angles, kinds="K").ride)
-    told = [guide.phase(_frame(i, SampleRotary=1.0, K=word)) for i, word in enumerate(("flat", "data", "data", "x"))]
-    assert told == [Phase(1, FrameKind.FLAT), Phase(2, FrameKind.PROJECTION), Phase(2, FrameKind.PROJECTION),
-                    Phase(3, None)]  # fmt: skip
+    told = [guide.phase(_frame(i, SampleRotary=1.0, K=word)) for i, word in enumerate(("flat", "data", "x", ""))]
+    assert told == [Phase(0, FrameKind.FLAT), Phase(0, FrameKind.PROJECTION), NO_SCAN, NOT_TOLD]
+    assert guide.phase(_frame(9, SampleRotary=1.0)) == NOT_TOLD  # once it was told
 
 
 def test_a_pandaboxs_file_is_followed(tmp_path: Path) -> None:
