@@ -47,8 +47,8 @@ _FEW = 0.2  # of the views: so many are named, however far they are off
 _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.009, 60 other scans at rest less
 # Off the turn with both ends, or without, which are a step apart; told of 31 of 40 other scans, falsely of none of 232.
 _OF_A_STEP = 1 / 3
-_BESIDE_ROW = 2  # rows on both sides of the plane of the source that count as in it
-_OFTEN, _AGREE, _FAN = 1.5, 0.01, 1.5  # times the least disagreement, which is a share of the variance; degrees
+_BESIDE_ROW = 8  # rows on both sides of the plane of the source that count as in it
+_OFTEN, _AGREE, _FAN = 1.2, 0.01, 2.5  # times the least disagreement, which is a share of the variance; degrees
 _SAME_AXIS = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
 _FAINT = 0.3  # line integral: of matter fainter than that, as much as the air may have at an edge is a large part
 _FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of

@@ -36,6 +36,8 @@ def warn_of_units(source: ScanSource, selection: ScanSelection, warn: Warn) -> N
     for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
         if sentence:
             warn(sentence)
+    if turned := source.attributes.get("turned"):
+        warn(Note(str(turned)))
     if (cone := selection.cone or source.cone) is not None and cone[1] < _LEAST_MAGNIFICATION * cone[0]:
         warn(
             f"The cone magnifies {cone[1] / cone[0]:.4g} times only: {cone[0]:g} mm from the source to the axis and "

@@ -105,7 +105,7 @@ def _from_tiff(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, flo
 def _tiff_spacing(tif: tifffile.TiffFile) -> tuple[float, float, float] | None:
     """Edges of a voxel (z, y, x) in mm, as Fiji (its unit, spacing and resolutions) or OME states all three."""
     facts, tags = tif.imagej_metadata or {}, tif.pages.first.tags
-    edges = [facts.get("spacing"), *(tags[name].value if name in tags else None for name in _RESOLUTIONS)]
+    edges: list[Any] = [facts.get("spacing"), *(tags[name].value if name in tags else None for name in _RESOLUTIONS)]
     units = [str(facts.get("unit")).replace("\\u00B5", "µ")] * 3
     if tif.is_ome:
         pixels = re.search(r"<(?:\w+:)?Pixels\b[^>]*>", tif.ome_metadata or "")

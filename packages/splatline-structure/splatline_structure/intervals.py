@@ -19,9 +19,9 @@ PROBED, PARTIAL = 0.05, 0.012
 """Of the gap of two levels: by how much thresholds are moved to see what they do, and may lie off by partial voxels."""
 OF_KIND = {"fraction": (0.5, 0.3), "surface": (0.5, 0.2), "size": (0.0, 0.05), "tortuosity": (0.0, 0.04)}
 """By the first word of a number's name: what all views would still change it by, over what half of them do, and the
-half-width over what voxels twice as wide change it by; of others, and of voxels that are no cubes, OTHERS. Found, as the
-figures above, on simulated grains, and looked at once on others (docs/structure.md). Sizes and tortuosities moved either
-way."""
+half-width over what voxels twice as wide change it by; of others, and of voxels that are no cubes, OTHERS. Found,
+as the figures above, on simulated grains, and looked at once on others (docs/structure.md). Sizes and tortuosities
+moved either way."""
 OTHERS = 0.5, 0.3
 BIAS = 0.012  # of a fraction, or of all the rest: by so much fractions of grains come out low, however many the views
 SPLIT_OR_MERGED = 0.62
