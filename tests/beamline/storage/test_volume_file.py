@@ -131,7 +131,14 @@ def test_fiji_states_the_edges_of_a_voxel(tmp_path: Path, unit: str, edge: float
 
 def test_ome_states_the_edges_of_a_voxel_and_a_bare_tiff_none(tmp_path: Path) -> None:
     edges = {"PhysicalSizeX": 0.5, "PhysicalSizeY": 0.5, "PhysicalSizeZ": 2.0, "PhysicalSizeZUnit": "µm"}
-    tifffile.imwrite(tmp_path / "v.ome.tif", np.ones((4, 5, 6), np.float32), metadata={"axes": "ZYX", **edges})
+    tifffile.imwrite(
+        tmp_path / "v.ome.tif",
+        np.ones((4, 5, 6), np.uint16),
+        photometric="minisblack",
+        metadata={"axes": "ZYX", **edges},
+    )
     assert read_volume(tmp_path / "v.ome.tif")[1] == pytest.approx((0.002, 0.0005, 0.0005))
-    tifffile.imwrite(tmp_path / "bare.tif", np.ones((4, 5, 6), np.float32), resolution=(72, 72))
+    tifffile.imwrite(
+        tmp_path / "bare.tif", np.ones((4, 5, 6), np.uint16), photometric="minisblack", resolution=(72, 72)
+    )
     assert read_volume(tmp_path / "bare.tif")[1] is None
