@@ -257,6 +257,10 @@ def results(record: ReconRecord) -> str:
         "report": record.report and f"{record.report}{drawn}",
         "volumes" if several else "volume": f"{several}{shape} in {record.unit or 'volume fractions'}{span}",
         "axis_col": f"{record.axis_col:.2f}",
+        "cone": "magnification" in record.parameters
+        and "magnification {magnification:.4g}, voxels of {voxel_mm:.4g} mm, fan of {fan_deg:.3g} degrees".format(
+            **record.parameters
+        ),
         "chosen": record.chosen,
     }
     lines = [f"{name:<10}{text}" for name, text in rows.items() if text]

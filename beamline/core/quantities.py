@@ -132,3 +132,12 @@ def doubt_span(span_deg: float) -> str:
                 f"mean {math.copysign(math.degrees(turn), span_deg):.0f}?"
             )
     return ""
+
+
+def cone_facts(cone: tuple[float, float], pixel_mm: float, cols: int) -> dict[str, float]:
+    """What distances (mm, from the source to the axis and to the detector) of a cone beam come to."""
+    return {
+        "magnification": cone[1] / cone[0],
+        "voxel_mm": pixel_mm * cone[0] / cone[1],
+        "fan_deg": 2 * math.degrees(math.atan(cols * pixel_mm / 2 / cone[1])),
+    }

@@ -23,6 +23,7 @@ from recon.base.arrays import F32, F64, median_deviation
 from recon.base.geometry import Geometry
 from recon.base.noise import NOISE_VIEWS, noise_level
 from recon.base.views import spread
+from recon.prep.fan import fans_shown
 from recon.prep.moments import ViewMoments, moments_of
 from recon.prep.projections import Projections
 from recon.prep.repeats import changes_seen
@@ -46,6 +47,8 @@ _FEW = 0.2  # of the views: so many are named, however far they are off
 _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.009, 60 other scans at rest less
 # Off the turn with both ends, or without, which are a step apart; told of 31 of 40 other scans, falsely of none of 232.
 _OF_A_STEP = 1 / 3
+_BESIDE_ROW = 8  # rows on both sides of the plane of the source that count as in it
+_OFTEN, _AGREE, _FAN = 1.2, 0.01, 2.5  # times the least disagreement, which is a share of the variance; degrees
 _SAME_AXIS = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
 _FAINT = 0.3  # line integral: of matter fainter than that, as much as the air may have at an edge is a large part
 _FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
@@ -116,6 +119,8 @@ def _conditions_of(prepared: PreparedProjections, *, whole: bool) -> list[Consis
             conditions = _conditions_within_the_field(prepared, some)
     if geometry.is_cone and not wide and covers_the_circle(geometry.angles):
         conditions.append(_lean_of_axis(data, some, geometry))
+    if not wide and not air_is_off and covers_the_circle(geometry.angles):
+        conditions.append(_fan(data, some, geometry))
     if (wide or not air_is_off) and not any(condition.broken for condition in conditions):
         conditions.append(_at_rest(data, geometry, frames, max(faint, 1.0)))
     return conditions
@@ -275,6 +280,31 @@ def _lean_of_axis(data: F32, some: NDArray[np.intp], geometry: Geometry) -> Cons
         "method, such as -m fista-tv."
     )
     return ConsistencyCondition("mirror images of a turn", abs(roll) * rows, least, "px of lean", sentence)
+
+
+def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCondition:
+    """Rays measured from both sides of a full turn agree, by the rows next to the plane of the source."""
+    row = int(np.clip(geometry.axis_row if geometry.is_cone else data.shape[1] / 2, 0, data.shape[1] - 1))
+    rows = slice(max(row - _BESIDE_ROW, 0), row + _BESIDE_ROW + 1)
+    pitch, across = geometry.pixel_pitch, max(geometry.axis_col, data.shape[2] - 1 - geometry.axis_col)
+    stated = pitch / geometry.sdd if geometry.is_cone else 0.0
+    sinogram = data[some][:, rows].mean(axis=1, dtype=np.float64)
+    off, least, best = fans_shown(sinogram, geometry.angles[some], geometry.axis_col, stated)
+    told, shown = (2 * math.degrees(math.atan(slope * across)) for slope in (stated, best))
+    away = f" ({pitch / best:.3g} mm from source to detector)" if geometry.is_cone and best > 0 else ""
+    check = (
+        "Check --cone SOD:SDD: both are in mm, and SDD goes from the source to the detector, not from the axis."
+        if geometry.is_cone
+        else "If the beam is a cone, give --cone SOD:SDD in mm; without, densities and shapes are wrong."
+    )
+    sentence = (
+        f"The views disagree with the stated geometry: rays that are measured from both sides agree for a fan of "
+        f"{shown:.3g} degrees across the detector{away} instead of {told:.3g}. {check}"
+    )
+    sure = off > _OFTEN * least and least < _AGREE
+    return ConsistencyCondition(
+        "rays from both sides", abs(shown - told) if sure else np.nan, _FAN, "degrees of fan", sentence
+    )
 
 
 def _across(shown: ViewMoments) -> ConsistencyCondition:

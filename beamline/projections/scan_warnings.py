@@ -23,6 +23,7 @@ from recon.base.masks import areas
 from recon.voxels.direct import has_direct_method
 from recon.voxels.field_edges import FieldEdges
 
+_LEAST_MAGNIFICATION = 1.02
 _SAME_AXIS = 0.05  # columns
 
 
@@ -35,6 +36,13 @@ def warn_of_units(source: ScanSource, selection: ScanSelection, warn: Warn) -> N
     for sentence in dict.fromkeys(doubt(name, value) for name, value in stated):
         if sentence:
             warn(sentence)
+    if turned := source.attributes.get("turned"):
+        warn(Note(str(turned)))
+    if (cone := selection.cone or source.cone) is not None and cone[1] < _LEAST_MAGNIFICATION * cone[0]:
+        warn(
+            f"The cone magnifies {cone[1] / cone[0]:.4g} times only: {cone[0]:g} mm from the source to the axis and "
+            f"{cone[1]:g} mm to the detector. Check --cone SOD:SDD: SDD goes from the source, not from the axis."
+        )
 
 
 def warn_of_other_axis(poses: ScanPoses | None, selection: ScanSelection, axis_col: float, warn: Warn) -> None:

@@ -146,6 +146,8 @@ class ScanSelection(Selection):
             # The central ray meets the same row of the detector, whatever rows are read.
             meets = (self.shape[0] - 1) / 2 if self.central_row is None else self.central_row
             try:
+                if self.cone[1] < (width := full[1] * pitch) / math.sqrt(2):
+                    raise ValueError(f"the source is {self.cone[1]:g} mm from a detector {width:.4g} mm wide")
                 geometry = Geometry.cone(
                     angles, full, pitch, *self.cone, axis_col=axis_col, axis_row=meets - rows.start
                 )  # fmt: skip

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.events import Sink, Warned
+from beamline.core.quantities import cone_facts
 from beamline.core.recon_events import VolumeDone
 from beamline.core.text import spans
 from beamline.projections.prepared import PreparedProjections
@@ -194,7 +195,7 @@ def _dataset(path: Path, part: Any) -> NDArray[np.float32]:
 def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: ReportContext) -> dict[str, Value]:
     """All parameters of the volume, by name."""
     selection, geometry, facts = context.selection, prepared.geometry, context.facts
-    done = recorded(in_order(selection), prepared.done)
+    done, cols = recorded(in_order(selection), prepared.done), geometry.detector_shape[1]
     parameters: dict[str, Value] = {
         "method": made.method,
         "axis_col": prepared.axis_col,
@@ -210,6 +211,7 @@ def parameters_of(made: Reconstruction, prepared: PreparedProjections, context: 
         "binning": selection.binning,
         "pixel_pitch": geometry.pixel_pitch,
         "pixel_pitch_unit": prepared.length_unit,
+        **(cone_facts((geometry.sod, geometry.sdd), geometry.pixel_pitch, cols) if geometry.is_cone else {}),
         "quantity": prepared.quantity,
         **done,
         **_pose_parameters(geometry),

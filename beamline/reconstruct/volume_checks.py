@@ -74,7 +74,7 @@ def check_volume(
     if made.series is not None:  # each view shows a volume of its own time
         figures = {"residual": made.series.residual, "seconds": made.seconds}
         return CheckedVolume(Judgement(figures), volumes, {made.method: figures}, warnings)
-    tell(_sample_radius(made, prepared))
+    tell(_sample_radius(made, prepared), _unused_levels(made))
     aspects, fitted = _aspects(made, prepared, context), by_name(made.method).fitted
     time = TimeLeft(clock.now, lambda seconds: not made.ending.early and context.leaves(seconds))
     progress = context.phases.progress
@@ -257,4 +257,17 @@ def _lost_matter(made: Reconstruction, prepared: PreparedProjections, fbp: Volum
         f"The {label_of(made.method)} volume keeps {lost.kept:.0%} of the mass that FBP shows above its own air "
         f"in a region of {z},{y},{x} [z, y, x]. Weak matter was lost, as where air is below zero. See --air in "
         "docs/corrections.md, give --allow-negative, or use --method fbp."
+    )
+
+
+def _unused_levels(made: Reconstruction) -> str:
+    """That the volume was not pulled to the levels that were given."""
+    levels = made.settings.get("levels")
+    if levels is None or not np.size(levels) or "levels_of_materials" in made.settings:
+        return ""
+    stated = ", ".join(f"{level:g}" for level in np.ravel(levels))
+    return (
+        f"The levels {stated} were not used, because views held out are not predicted better with them: the volume is "
+        "that of total variation. Levels are densities in the unit of the volume, without the air's; leave them out to "
+        "have them found."
     )

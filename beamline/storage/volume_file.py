@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -22,13 +23,16 @@ from beamline.storage.readers.tiff import require_possible
 
 LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
 """mm of a metre, a millimetre and a micrometre, by NIfTI's xyzt_units; an unstated unit counts as mm."""
+_RESOLUTIONS = "YResolution", "XResolution"  # pixels to a unit, as fractions
 SUFFIXES = (".tif", ".tiff", ".npy", ".npz", ".nii", ".nii.gz", ".h5", ".hdf5", ".nxs")
 
 
 def read_volume(
     path: Path, dataset: str | None = None
 ) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
-    """Read a volume, and the voxel spacing in mm along its axes if NIfTI, OME-Zarr or `voxel_mm` of an .npz state it.
+    """Read a volume, and the voxel spacing in mm along its axes, if the file states it.
+
+    NIfTI, OME-Zarr, ImageJ's and OME's TIFFs and `voxel_mm` (`slice_mm`) of an .npz do.
 
     Args:
         dataset: path in an HDF5 file or a Zarr, or name in an .npz; None: the only array of three axes.
@@ -59,7 +63,7 @@ def read_volume(
             with hdf5.open_hdf5(path) as file:
                 return _from_hdf5(path, file, dataset)
         if name.endswith((".tif", ".tiff")):
-            return _from_tiff(path), None
+            return _from_tiff(path)
         return _from_numpy(path, dataset)
     except DataError:
         raise
@@ -88,14 +92,35 @@ def _is_numpy(path: Path) -> bool:
         return file.read(6).startswith((b"PK", b"\x93NUMPY"))
 
 
-def _from_tiff(path: Path) -> NDArray[np.generic]:
+def _from_tiff(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
     require_regular(path)
     refuse_substitute(path)
     with tifffile.TiffFile(path) as tif:
         require_possible(tif)
         series = tif.series[0]
         require_room(path, math.prod(series.shape) * np.dtype(series.dtype).itemsize)
-        return tif.asarray()
+        return tif.asarray(), _tiff_spacing(tif)
+
+
+def _tiff_spacing(tif: tifffile.TiffFile) -> tuple[float, float, float] | None:
+    """Edges of a voxel (z, y, x) in mm, as Fiji (its unit, spacing and resolutions) or OME states all three."""
+    facts, tags = tif.imagej_metadata or {}, tif.pages.first.tags
+    edges: list[Any] = [facts.get("spacing"), *(tags[name].value if name in tags else None for name in _RESOLUTIONS)]
+    units = [str(facts.get("unit")).replace("\\u00B5", "µ")] * 3
+    if tif.is_ome:
+        pixels = re.search(r"<(?:\w+:)?Pixels\b[^>]*>", tif.ome_metadata or "")
+        stated = dict(re.findall(r'PhysicalSize(\w+)="([^"]*)"', pixels[0] if pixels else ""))
+        edges, units = [stated.get(each) for each in "ZYX"], [stated.get(f"{each}Unit", "µm") for each in "ZYX"]
+    try:
+        mm = [
+            (edge[1] / edge[0] if isinstance(edge, tuple) else float(edge))
+            * (datasets.factor_of(unit, datasets.LENGTH_UNITS) or math.nan)
+            for edge, unit in zip(edges, units, strict=True)
+        ]
+    except (TypeError, ValueError, ArithmeticError):
+        return None
+    z, y, x = mm
+    return (z, y, x) if all(0 < each < math.inf for each in mm) else None
 
 
 def _from_folder(path: Path) -> NDArray[np.generic]:
@@ -116,7 +141,7 @@ def _from_folder(path: Path) -> NDArray[np.generic]:
     slices: NDArray[np.generic] | None = None
     for z, name in enumerate(natural_sorted(item.name for item in files)):
         try:
-            values = _from_tiff(path / name)
+            values, _ = _from_tiff(path / name)
         except Exception as error:  # as of other foreign files
             raise DataError(f"{path / name} cannot be read ({type(error).__name__}: {error}).") from error
         if slices is None:

@@ -199,12 +199,15 @@ def remove_rings_in_place(
     return taken, f"Rings: removed by {how}; stripes of {before:.1f} times the noise of a column became {after:.1f}."
 
 
+_FAINTEST = 1e-5  # of the largest line integral: fainter stripes are seen in views without noise alone
+
+
 def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
     """A sentence if pixels respond so unequally that rings are visible, with the remedy; otherwise ""."""
     if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
         return ""
     steady = steadiness(views[np.ix_(np.argsort(angles, kind="stable"), _some_rows(views))], axis_col)
-    if steady is None or not steady.stripes:
+    if steady is None or not steady.stripes or steady.odd < _FAINTEST * float(np.abs(views).max()):
         return ""
     return (
         f"Rings: pixels answer unequally, by {steady.odd:.2g} of line integral, {steady.score:.1f} times the noise of "

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from recon.base.arrays import F64
 from recon.base.geometry import Geometry
 
-_GAP_LIMIT = 8.0  # an angular gap this many times the median may be missing data, not coarse sampling
+_GAP_LIMIT = 8.0  # an angular gap this many times the usual one may be missing data, not coarse sampling
+_FAR = np.pi / 6  # a gap beyond this is missing data, however many are like it, unless most views are as far apart
 _THINNED = 2.5  # usual steps between the views of a part of a scan, at most
 _SAME_ANGLE = 1e-3  # of the mean step: views closer than this share one weight
 
@@ -20,8 +21,8 @@ def angular_weights(angles: ArrayLike, of: ArrayLike | None = None) -> NDArray[n
     """Quadrature weight of each view: its Voronoi cell on the half circle, in radians.
 
     Views at θ and θ + π see the same rays, so angles count modulo π; equal ones share their cell. The weights sum to π
-    where the half circle is covered. A gap of more than 8 median steps, and wider than random angles leave by chance,
-    is a missing wedge: views beside it weigh as if the sampling continued, and the sum is the covered angle.
+    where the half circle is covered, also by views in groups, and by views of which a part is repeated finely. Views
+    beside a missing wedge (see `_missing`) weigh as if the sampling continued, and the sum is the covered angle.
 
     Args:
         angles: [view], radians, any order and range.
@@ -49,11 +50,11 @@ def angular_weights(angles: ArrayLike, of: ArrayLike | None = None) -> NDArray[n
         return np.full(theta.size, (np.pi if whole is None else _usual_step(whole)) / theta.size)
     gaps = np.diff(starts, append=starts[0] + np.pi)
     if whole is None:
-        typical, widest = float(np.median(gaps)), _widest(gaps, math.pi)
+        typical, missing = float(np.median(gaps)), _missing(gaps, math.pi)
     else:
-        typical = _usual_step(whole)
-        widest = _GAP_LIMIT * float(np.clip(np.median(gaps), typical, _THINNED * typical))
-    gaps = np.where(gaps > widest, typical, gaps)
+        typical, half = _usual_step(whole), _half_step(_different(whole))
+        missing = gaps > _GAP_LIMIT * np.clip(_half_step(gaps), half, _THINNED * half)
+    gaps = np.where(missing, typical, gaps)
     cells = (gaps + np.roll(gaps, 1)) / 2
     weights = np.empty_like(theta)
     weights[order] = (cells / np.bincount(group))[group]
@@ -62,9 +63,21 @@ def angular_weights(angles: ArrayLike, of: ArrayLike | None = None) -> NDArray[n
 
 def _usual_step(angles: F64) -> float:
     """The median step between different angles modulo π."""
+    return float(np.median(_different(angles)))
+
+
+def _different(angles: F64) -> F64:
+    """The gaps between different angles modulo π."""
     theta = np.unique(np.mod(angles, np.pi))
     gaps = np.diff(theta, append=theta[0] + np.pi)
-    return float(np.median(gaps[gaps > _SAME_ANGLE * np.pi / angles.size]))
+    return gaps[gaps > _SAME_ANGLE * np.pi / angles.size]
+
+
+def _half_step(gaps: F64) -> float:
+    """The gap up to which gaps make up half of the angle, without the widest: of views in groups, that between them."""
+    most = np.sort(gaps)[:-1] if gaps.size > 1 else gaps
+    total = np.cumsum(most)
+    return float(most[np.searchsorted(total, total[-1] / 2)])
 
 
 def covers_the_circle(angles: ArrayLike) -> bool:
@@ -210,10 +223,10 @@ def cone_weights(geometry: Geometry) -> tuple[F64, tuple[int, int]]:
     order, beta, cells = _arc(geometry.angles)
     lacking = missing_arc(geometry)
     if lacking > 0:
+        need = f"a gap: {np.rad2deg(lacking):.4g} degrees more are needed" if lacking < math.inf else "several gaps"
         raise ValueError(
-            f"the angles leave a gap: {np.rad2deg(lacking):.4g} degrees more are needed, or some rays of the field are "
-            "seen by no view. FDK takes a full circle, or a short scan of 180 degrees and the angle of the fan: use an "
-            "iterative method (fista-tv, sirt)"
+            f"the angles leave {need}, or some rays of the field are seen by no view. FDK takes a full circle, or a "
+            "short scan of 180 degrees and the angle of the fan: use an iterative method (fista-tv, sirt)"
         )
     arc, gamma = float(cells.sum()), -_fan_angles(geometry)[order]
     most = (arc - np.pi) / 2
@@ -232,7 +245,7 @@ def missing_arc(geometry: Geometry) -> float:
     if covers_the_circle(geometry.angles):
         return 0.0
     _, beta, cells = _arc(geometry.angles)
-    if beta.size < 3 or np.diff(beta).max() > _GAP_LIMIT * np.median(np.diff(beta)):
+    if beta.size < 3 or np.diff(beta).max() > _GAP_LIMIT * _usual(np.diff(beta)):
         return math.inf
     return max(0.0, np.pi + 2 * float(np.abs(_fan_angles(geometry)).max()) - float(cells.sum()))
 
@@ -268,17 +281,26 @@ def unseen_wedges(geometry: Geometry) -> list[Wedge]:
     typical = float(np.median(gaps))
     if math.pi - float(angular_weights(geometry.angles).sum()) < typical / 2:
         return []
-    wide = np.flatnonzero(gaps > _widest(gaps, math.pi))
+    wide = np.flatnonzero(_missing(gaps, math.pi))
     return [Wedge(float(np.mod(theta[at] + typical / 2, np.pi)), float(gaps[at] - typical)) for at in wide]
 
 
-def _widest(gaps: F64, circle: float) -> float:
-    """The widest gap that even or random views leave in a circle; in a wider one, views are missing.
+def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
+    """In which gaps of a circle views are missing: wider than random views leave by chance, and than 8 usual ones.
 
     One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1), here 1 in 20.
     """
     by_chance = circle * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
-    return max(_GAP_LIMIT * float(np.median(gaps)), by_chance)
+    return gaps > max(_GAP_LIMIT * _usual(gaps), by_chance)
+
+
+def _usual(gaps: F64) -> float:
+    """The usual gap: by the angle that gaps take, as views in groups, or a part repeated finely, have a small median.
+
+    It is an eighth of 30 degrees at most, or the median: views are missing in wider gaps, however many there are.
+    """
+    median = float(np.median(gaps))
+    return min(max(_half_step(gaps), median), max(_FAR / _GAP_LIMIT, median))
 
 
 def _arc(angles: F64) -> tuple[NDArray[np.intp], F64, F64]:
@@ -340,4 +362,4 @@ def _gaps(theta: F64) -> tuple[NDArray[np.intp], F64]:
 def _leave_an_arc(gaps: F64) -> bool:
     widest, typical = float(gaps.max()), float(np.median(gaps))
     arc = widest > np.pi / 4 and widest > 3 * typical
-    return arc or widest >= np.pi or widest > _widest(gaps, 2 * math.pi)
+    return bool(arc or widest >= np.pi or _missing(gaps, 2 * math.pi).any())

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from beamline.core.errors import DataError, damaged, user_message
+from beamline.core.quantities import cone_facts
 from beamline.core.text import count, frames_text, spans
 from beamline.storage import hdf5
 from beamline.storage.readers.base import ScanSource, TakesTooLongError, read_known
@@ -212,7 +213,9 @@ def describe_source(source: ScanSource, clock: Callable[[], float] = time.monoto
     if not source.finished:
         dead = not held(source.path) if "status" in attributes else abandoned(source.path)  # our writer has a lock
         attributes["status"] = "died" if dead else RUNNING
-    optional = {"pixel_height_mm": source.row_pitch_mm, "cone_mm": source.cone}
+    optional: dict[str, Any] = {"pixel_height_mm": source.row_pitch_mm, "cone_mm": source.cone}
+    if source.cone is not None and source.pixel_size_mm is not None:
+        optional |= cone_facts(source.cone, source.pixel_size_mm, source.shape[1])
     facts = {
         "path": str(source.path),
         "format": source.format,

@@ -66,6 +66,12 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
     )
 
 
+_TURNED = (
+    "Frames are turned by a quarter turn, so that the last column becomes the first row. If the camera was turned the "
+    "other way, the volume is the mirror image of the sample."
+)
+
+
 def turned(base: ScanSource) -> ScanSource:
     """A scan with its frames rotated by a quarter turn: a horizontal rotation axis becomes vertical.
 
@@ -81,6 +87,7 @@ def turned(base: ScanSource) -> ScanSource:
         base,
         pixels=lambda read, frames, rows: np.ascontiguousarray(np.rot90(read(frames), axes=(1, 2))[:, rows]),
         shape=base.shape[::-1],
+        attributes=lambda known: {**known, "turned": _TURNED},
         axis_col=None,
         central_ray=None
         if base.central_ray is None

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from beamline.storage.rules import Finding
 from beamline.storage.rules.evidence import ScanEvidence
 from recon.base.units import gone_round, look_like_degrees
+from recon.voxels.view_weights import angular_weights
 
 FARTHEST = 1e6  # degrees
 _GAP = 0.5  # degrees without a view beyond the others, of views in even steps
+_UNWEIGHED = 9.0  # degrees that no view's weight covers: FBP loses a twentieth of the density
 _SAME = 0.1  # of the mean step: views so close are one
 _EQUAL, _FEW = 1e-3, 4  # degrees between views of one direction; columns of the detector to a direction
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
@@ -82,7 +84,9 @@ def directions(angles: NDArray[np.float64]) -> int:
 
 
 def half_turn_unseen(angles: NDArray[np.float64]) -> float:
-    """Largest gap in degrees of half a turn without a view, beyond the spacing of the views [view] in rad.
+    """Degrees of half a turn without a view, beyond the spacing of the views [view] in rad: the largest gap, or all.
+
+    All gaps count in which `angular_weights` take views for missing, if these are a twentieth of half a turn.
 
     Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
     distributed length, whose mean is that of all gaps (Rényi 1953); one scan in a thousand (of ten views: in a hundred)
@@ -100,7 +104,8 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
     limit = second + max(_GAP, times * uneven)
     if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
         limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
-    return float(largest) if largest > limit else 0.0
+    unweighed = 180.0 - float(np.degrees(angular_weights(angles).sum()))
+    return max(float(largest) if largest > limit else 0.0, unweighed if unweighed > _UNWEIGHED else 0.0)
 
 
 def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,17 +10,34 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamline.cli.options import json_option, parsed
+from beamline.cli.recipe import Repeatable, typed_line
 from beamline.cli.terminal import Answer, answering
 from beamline.core.errors import ConfigError, DataError
 from beamline.core.files import atomic_file, refuse_existing
+from beamline.core.sinks import Note
 from beamline.core.text import count, memory_size, safe_name
 
 if TYPE_CHECKING:
     from splatline_structure.intervals import Found
+    from splatline_structure.materials import Spacing
     from splatline_structure.volumes import Box, ReadSlices
 
 _FILE = click.Path(path_type=Path)
 FEWEST_VIEWS = 16  # that can be parted, 8 of each half
+
+
+def edges_of(text: str) -> Spacing:
+    """Parse edges of a voxel (z, y, x) in µm, one or three. Raises ValueError for others."""
+    try:
+        z, y, x = map(float, text.split(":") if ":" in text else [text] * 3)
+    except ValueError:
+        z = y = x = math.nan
+    if not all(0 < edge < math.inf for edge in (z, y, x)) or not math.isclose(y, x, rel_tol=1e-3):
+        raise ValueError(
+            f"{text!r}: expected the edge of a voxel in µm, such as 0.65, or Z:Y:X, such as 3:1:1, with Y as X: pixels "
+            "of a slice are squares"
+        )
+    return z, y, x
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +60,13 @@ class Seen:
         return ",".join(f"{each.start}:{each.stop}" for each in (slices, *self.box[1:]))
 
 
-@click.command()
+@click.command(cls=Repeatable)
 @click.argument("volumes", metavar="VOLUME...", nargs=-1, required=True, type=_FILE)
 @click.option("--compare", is_flag=True, help="Two volumes, such as charged and discharged: what changed.")
 @click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
-@click.option("--voxel-um", type=click.FloatRange(min=0, min_open=True), help="Edge of a voxel. Default: the file's.")
-@click.option("--materials", type=click.IntRange(2, 6), default=2, show_default=True, help="Number of materials.")
+@click.option("--voxel-um", metavar="EDGE|Z:Y:X", callback=parsed(edges_of),
+              help="Edge of a voxel, or its three. Default: the file's.")  # fmt: skip
+@click.option("--materials", type=click.IntRange(2, 6), help="Number of materials. Default: that of labels, or 2.")
 @click.option(
     "--particles",
     type=click.IntRange(1),
@@ -135,7 +154,7 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
         reads = [
             read_volume(
                 path, values["dataset"], values["voxel_um"], values["slices"], memory, values["crop"] == "square",
-                whole=len(paths) > 1,
+                len(paths) > 1, answer.warn,
             )
             for path in paths
         ]  # fmt: skip
@@ -173,15 +192,27 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
     import numpy as np
 
     from splatline_structure.intervals import found_in
+    from splatline_structure.materials import label_values
     from splatline_structure.numbers import Rules
 
-    n_materials, particles = values["materials"], values["particles"] or values["materials"]
+    grid, data, parts = read.record.grid.part(*box), read.record.volume.data, []
+    volume = np.ascontiguousarray(data[box])
+    labels = label_values(volume)
+    n_materials = values["materials"] or labels.size or 2
+    particles = values["particles"] or n_materials
+    if labels.size not in (0, n_materials):
+        raise ValueError(
+            f"it holds {labels.size} values ({', '.join(f'{each:g}' for each in labels)}), which are labels, not grey "
+            f"values: {n_materials} --materials cannot be told among them; leave it out, and each label is a material"
+        )
+    if labels.size:
+        stated = ", ".join(f"{each:g}" for each in labels)
+        answer.warn(Note(f"{path} is taken as labels, not as grey values: {stated} are materials 1 to {labels.size}."))
     if max(particles, values["through"]) > n_materials:
         raise ConfigError(
             f"Material {max(particles, values['through'])} of {n_materials}: they are numbered from 1. Nothing was "
             "written."
         )
-    grid, data, parts = read.record.grid.part(*box), read.record.volume.data, []
     for half in _parts(path, read, answer, **values):
         if half.shape != data.shape:
             raise ValueError(
@@ -191,7 +222,6 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
         parts.append(np.ascontiguousarray(half[box]))
     rules = Rules(particles, values["through"], values["radius"], values["smallest"], values["neck"], values["side"])
     dz, dy, dx = (1e3 * edge for edge in grid.spacing)
-    volume = np.ascontiguousarray(data[box])
     try:
         found = found_in(volume, parts, n_materials, (dz, dy, dx), rules, answer.counting("structures"))
     except ValueError as error:
@@ -244,7 +274,7 @@ def _write(seen: list[Seen], compare: bool, output: Path, values: dict[str, Any]
     settings = {
         "volume": first.path,
         **{name: value for name, value in values.items() if value is not None},
-        "command": " ".join(("beamline structure", *(str(each.path) for each in seen))),
+        "command": typed_line(click.get_current_context()),
     }
     states = [
         results.facts_of(each.found, {

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from splatline_structure.materials import F32, F64, Materials, labelled, materials_of, probabilities
+from splatline_structure.materials import F32, F64, Materials, Spacing, labelled, materials_of, probabilities
 from splatline_structure.numbers import Rules, Structure, coarse, shares_of, structure_of
-from splatline_structure.particles import Particles, Spacing
+from splatline_structure.particles import Particles
 
 BIAS_UNSURE, NOISE = 0.5, 1.5
 """Half-width by the views: over what half of them change a number by, and over half the difference of both halves."""
@@ -19,9 +19,11 @@ PROBED, PARTIAL = 0.05, 0.012
 """Of the gap of two levels: by how much thresholds are moved to see what they do, and may lie off by partial voxels."""
 OF_KIND = {"fraction": (0.5, 0.3), "surface": (0.5, 0.2), "size": (0.0, 0.05), "tortuosity": (0.0, 0.04)}
 """By the first word of a number's name: what all views would still change it by, over what half of them do, and the
-half-width over what voxels twice as wide change it by; of others OTHERS. Found, as the figures above, on simulated
-grains, and looked at once on others (docs/structure.md). Sizes and tortuosities moved either way."""
+half-width over what voxels twice as wide change it by; of others, and of voxels that are no cubes, OTHERS. Found,
+as the figures above, on simulated grains, and looked at once on others (docs/structure.md). Sizes and tortuosities
+moved either way."""
 OTHERS = 0.5, 0.3
+BIAS = 0.012  # of a fraction, or of all the rest: by so much fractions of grains come out low, however many the views
 SPLIT_OR_MERGED = 0.62
 """Of n whole particles some are split, merged or cut otherwise than in the sample: the share s of their volume below a
 size lies off by this times √(s (1 - s) / n). Found on twenty scenes (docs/structure.md)."""
@@ -158,6 +160,7 @@ def found_in(
             wide[name],
             off,
             _of_particles(name, whole.particles),
+            max(spacing) < 1.05 * min(spacing),
         )
         for name, value in whole.numbers.items()
     }
@@ -165,10 +168,13 @@ def found_in(
 
 
 def _of_particles(name: str, particles: Particles) -> float:
-    """Half-width of a quantile of sizes, as particles split, merge or are cut otherwise; 0 of another number."""
+    """Half-width of a quantile of sizes, as particles split, merge or are cut otherwise; 0 of another number, infinite
+    of a single whole particle."""
     kind, _, percent = name.partition("_")
     if kind != "size" or particles.cut.all():
         return 0.0
+    if np.count_nonzero(~particles.cut) == 1:
+        return math.inf
     share = int(percent) / 100
     off = SPLIT_OR_MERGED * math.sqrt(share * (1 - share) / np.count_nonzero(~particles.cut))
     return (particles.quantile(share + off) - particles.quantile(share - off)) / 2
@@ -182,18 +188,21 @@ def _interval(
     wide: float,
     off: float,
     of_particles: float,
+    cubes: bool,
 ) -> Interval:
     kind = name.split("_")[0]
     if not math.isfinite(value):
         nothing = "nothing connects the faces" if math.isinf(value) else "there is no whole particle in the field"
         return Interval(value, why_not=nothing if kind != "connected" else "there is none of the material")
+    if of_particles == math.inf:
+        return Interval(value, why_not="only one particle is whole, which has no distribution of sizes")
     if not all(map(math.isfinite, (*halves, *sides, wide))):
         return Interval(value, why_not="it is there or not by the threshold, half of the views, or the voxels")
-    still, of_voxels = OF_KIND.get(kind, OTHERS)
+    still, of_voxels = OF_KIND.get(kind, OTHERS) if cubes else (OF_KIND.get(kind, OTHERS)[0], OTHERS[1])
     change = value - float(np.mean(halves)) if halves else math.nan
     moves, views = still * change, math.hypot(BIAS_UNSURE * change, NOISE * float(np.ptp(halves or [0.0])) / 2)
     levels = abs(sides[0] - sides[1]) / 2 * off / PROBED
-    voxels = of_voxels * abs(wide - value)
+    voxels = math.hypot(of_voxels * abs(wide - value), BIAS * min(value, 1 - value) if kind == "fraction" else 0.0)
     return _judged(
         kind, Interval(value, moves=moves, views=views, levels=levels, voxels=voxels, particles=of_particles)
     )

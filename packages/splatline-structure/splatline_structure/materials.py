@@ -20,11 +20,13 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Labels = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Spacing = tuple[float, float, float]
 
 _ROUNDS, _LOOKED_AT = 4, 160  # voxels of a side of the cube in the middle that shows the levels
 _CORE = 2  # voxels from an edge from which on a voxel shows the level of its material
 _TRIMMED = 0.02  # share of a core's voxels left out at each end: specks of others
 _LEAST = 200  # voxels of a core, else the outer quarter of the material's values shows the level
+MOST = 6  # materials
 MOST_BETWEEN = 1.5
 """Voxels half-way between two levels over those near the rarer one; of one normal distribution cut in two, 2.2."""
 
@@ -49,19 +51,33 @@ class Materials:
         return (self.levels[1:] + self.levels[:-1]) / 2
 
 
-def central(mask: NDArray[Any], side: int) -> NDArray[Any]:
-    """The cube of `side` voxels in the middle, cut to the volume."""
-    return mask[tuple(slice(max((n - side) // 2, 0), max((n - side) // 2, 0) + min(side, n)) for n in mask.shape)]
+def central(mask: NDArray[Any], side: int, spacing: Spacing = (1, 1, 1)) -> NDArray[Any]:
+    """The cube in the middle of `side` voxels of the shortest edge, cut to the volume."""
+    sides = [max(round(side * min(spacing) / edge), 1) for edge in spacing]
+    firsts = [max((n - each) // 2, 0) for n, each in zip(mask.shape, sides, strict=True)]
+    return mask[tuple(slice(first, first + each) for first, each in zip(firsts, sides, strict=True))]
+
+
+def label_values(volume: F32) -> F64:
+    """The values of a volume of labels, which has been segmented: 2 to 6 different ones; none of grey values."""
+    for some in (volume[len(volume) // 2], volume):
+        values = np.unique(some)
+        if values.size > MOST:
+            return np.empty(0)
+    return values.astype(np.float64) if values.size > 1 else np.empty(0)
 
 
 def materials_of(volume: F32, count: int, seed: int = 0) -> Materials:
     """Levels of `count` materials: k-means, then the mean of each material's voxels more than two voxels from its edge.
 
     Partial voxels lie between levels: they take no part. Of a large volume the 160³ voxels in the middle are looked at.
+    If the volume holds `count` labels, they are the levels.
 
     Raises:
         ValueError: one value, or no contrast between two materials.
     """
+    if (known := label_values(volume)).size == count:
+        return Materials(known, np.full(count, 1e-3 * np.diff(known).min()), np.zeros(count))
     volume = central(volume, _LOOKED_AT)
     levels = clusters(volume, count, seed).centres
     for _ in range(_ROUNDS):

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from splatline_structure.materials import F32, F64, Labels, central, labelled
-from splatline_structure.particles import NECK, Numbers, Particles, Spacing, cleaned, measured, parted, surfaces
+from splatline_structure.materials import F32, F64, Labels, Spacing, central, labelled
+from splatline_structure.particles import NECK, Numbers, Particles, cleaned, measured, parted, surfaces
 from splatline_structure.transport import connecting, tortuosity
 
 
 @dataclass(frozen=True)
 class Rules:
-    """How numbers are taken.
+    """How numbers are taken; voxels that are no cubes count as cubes of their shortest edge.
 
     Attributes:
         particles: number of the material, from 1, the least dense, whose particles are measured.
@@ -38,7 +38,7 @@ class Rules:
     @property
     def of_coarse_voxels(self) -> Rules:
         """The same rules for voxels twice as wide."""
-        return replace(self, smallest=max(self.smallest // 8, 1), side=self.side // 2)
+        return replace(self, smallest=max(self.smallest // 8, 1), side=(self.side + 1) // 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -
     """
     labels = labelled(volume, thresholds)
     mask = labels == rules.particles - 1
-    numbered = parted(cleaned(mask, rules.radius, rules.smallest), rules.neck)
+    numbered = parted(cleaned(mask, rules.radius, rules.smallest, spacing), rules.neck, spacing)
     particles = measured(numbered, spacing)
     whole, inside = ~particles.cut, numbered > 0
     numbers = shares_of(labels, len(thresholds) + 1, spacing, rules)
@@ -90,7 +90,7 @@ def structure_of(volume: F32, thresholds: F64, spacing: Spacing, rules: Rules) -
         share = int(connecting(through, axis).sum()) / max(int(through.sum()), 1)
         numbers[f"connected_{name}"] = share if through.any() else math.nan
         if rules.side:
-            numbers[f"tortuosity_{name}"] = tortuosity(central(through, rules.side), axis)
+            numbers[f"tortuosity_{name}"] = tortuosity(central(through, rules.side, spacing), axis, spacing)
     return Structure(labels, numbered, particles, numbers, mask.mean(axis=(1, 2)), _radial(mask, spacing))
 
 

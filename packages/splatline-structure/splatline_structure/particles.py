@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from skimage.morphology import ball, local_maxima, reconstruction
+from skimage.morphology import local_maxima, reconstruction
 from skimage.segmentation import watershed
 
-from splatline_structure.materials import F64, Mask
+from splatline_structure.materials import F64, Mask, Spacing
 
 Numbers = NDArray[np.int32]
-Spacing = tuple[float, float, float]
 
 NECK = 0.8
 """Two parts are one particle if the neck between them has at least this share of the narrower part's width."""
@@ -67,26 +66,31 @@ class Particles:
         return float(np.interp(share, middles, self.diameter[~self.cut][order]))
 
 
-def cleaned(mask: Mask, radius: int = 1, smallest: int = 27) -> Mask:
+def cleaned(mask: Mask, radius: int = 1, smallest: int = 27, spacing: Spacing = (1, 1, 1)) -> Mask:
     """The mask opened and closed, with holes filled, and parts of fewer than `smallest` voxels removed.
 
-    The volume is continued beyond its faces, so that a particle there loses nothing.
+    The volume is continued beyond its faces, so that a particle there loses nothing. Voxels count as cubes of their
+    shortest edge.
 
     Args:
         radius: of opening and closing by a ball, voxels; 0: neither.
+        spacing: edges of a voxel (z, y, x).
     """
+    edges = np.array(spacing) / min(spacing)
     out = mask
     if radius:
         out = np.pad(out, 2 * radius, mode="edge")
-        out = ndimage.binary_closing(ndimage.binary_opening(out, ball(radius)), ball(radius))
+        away = np.moveaxis(np.indices((2 * radius + 1,) * 3) - radius, 0, -1) * edges
+        ball = (away**2).sum(axis=-1) <= radius**2
+        out = ndimage.binary_closing(ndimage.binary_opening(out, ball), ball)
         out = out[(slice(2 * radius, -2 * radius),) * 3]
     parts, n = ndimage.label(ndimage.binary_fill_holes(out))
-    kept = np.bincount(parts.ravel(), minlength=n + 1) >= smallest
+    kept = np.bincount(parts.ravel(), minlength=n + 1) * edges.prod() >= smallest
     kept[0] = False
     return np.asarray(kept[parts])
 
 
-def parted(mask: Mask, neck: float) -> Numbers:
+def parted(mask: Mask, neck: float, spacing: Spacing = (1, 1, 1)) -> Numbers:
     """Labels [z, y, x] of the particles, 0 elsewhere: connected parts, separated at narrow necks.
 
     Watershed of the distance to the outside from its maxima (Beucher & Lantuéjoul 1979). Two maxima are one particle if
@@ -95,20 +99,22 @@ def parted(mask: Mask, neck: float) -> Numbers:
 
     Args:
         neck: 0: connected parts as they are; 1 or more: every maximum is a particle.
+        spacing: edges of a voxel (z, y, x); distances count in the shortest.
     """
+    edges = np.array(spacing) / min(spacing)
     connected, _ = ndimage.label(mask)
     if neck <= 0:
         return connected.astype(np.int32)
     labels, last = np.zeros(mask.shape, np.int32), 0
     for number, box in enumerate(ndimage.find_objects(connected), 1):
         inside = np.pad(connected[box] == number, 1)
-        distance = ndimage.distance_transform_edt(inside).astype(np.float32)
+        distance = ndimage.distance_transform_edt(inside, edges).astype(np.float32)
         tops = distance
         if neck < 1:  # with this offset, heights differ by log(neck) where distances are `neck` times, less _GRID
             height = np.log(distance + np.float32(_GRID / (1 - neck)))
             tops = reconstruction(height + np.float32(math.log(neck)), height, footprint=_FACES)
         maxima, _ = ndimage.label(local_maxima(tops, connectivity=1) & inside)
-        basins = watershed(-ndimage.gaussian_filter(distance, 0.7), maxima, 3, mask=inside)[1:-1, 1:-1, 1:-1]
+        basins = watershed(-ndimage.gaussian_filter(distance, 0.7 / edges), maxima, 3, mask=inside)[1:-1, 1:-1, 1:-1]
         labels[box] = np.where(basins > 0, basins + last, labels[box])
         last += int(basins.max())
     return labels

@@ -26,7 +26,7 @@ COLUMNS = "number", "unit", "value", "low", "high", "decides", "moves", *CAUSES
 
 def cells(name: str, interval: Interval) -> list[str]:
     """A row of `COLUMNS`; numbers that are not determined are given as such."""
-    figures = [f"{getattr(interval, each):.4g}" for each in ("moves", *CAUSES)]
+    figures = [f"{getattr(interval, each):.4g}".replace("nan", "") for each in ("moves", *CAUSES)]
     if interval.why_not:
         return [name, unit_of(name), "not determined", "", "", interval.why_not, *figures]
     ends = [f"{each:.4g}" for each in (interval.value, interval.low, interval.high)]

@@ -9,7 +9,7 @@ from scipy import ndimage
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import cg
 
-from splatline_structure.materials import Mask
+from splatline_structure.materials import Mask, Spacing
 
 _CLOSE = 1e-5  # residual of the solution, relative
 
@@ -22,11 +22,15 @@ def connecting(mask: Mask, axis: int) -> Mask:
     return np.isin(parts, both[both > 0])
 
 
-def tortuosity(mask: Mask, axis: int) -> float:
+def tortuosity(mask: Mask, axis: int, spacing: Spacing = (1, 1, 1)) -> float:
     """Tortuosity factor along `axis`: share of the material over its relative diffusivity (Cooper et al. 2016).
 
     Laplace's equation in the material, with a difference of 1 between the two faces and no flux elsewhere, by
-    conjugate gradients with the diagonal as preconditioner. Voxels are cubes.
+    conjugate gradients with the diagonal as preconditioner. Two voxels conduct as the area between them over their
+    distance, relative to those along `axis`.
+
+    Args:
+        spacing: edges of a voxel (z, y, x).
 
     Returns:
         1 for a straight channel; infinity where nothing connects the faces.
@@ -37,15 +41,17 @@ def tortuosity(mask: Mask, axis: int) -> float:
         return math.inf
     number = np.full(through.shape, -1, np.int32)
     number[through] = np.arange(n)
-    ones, others = [], []
-    for d in range(3):
+    ones, others, conducts = [], [], []
+    edges = np.r_[spacing[axis], np.delete(spacing, axis)]  # in the order of the axes of `through`
+    for d, conductance in enumerate((spacing[axis] / edges) ** 2):
         line = np.moveaxis(number, d, 0)
         both = (line[1:] >= 0) & (line[:-1] >= 0)
         ones.append(line[1:][both])
         others.append(line[:-1][both])
+        conducts.append(np.full(others[-1].size, conductance))
     one, other = np.concatenate(ones), np.concatenate(others)
     first, last = number[0][number[0] >= 0], number[-1][number[-1] >= 0]
-    links = csr_array((np.ones(2 * one.size), (np.r_[one, other], np.r_[other, one])), (n, n))
+    links = csr_array((np.tile(np.concatenate(conducts), 2), (np.r_[one, other], np.r_[other, one])), (n, n))
     diagonal = links.sum(axis=1) + 2.0 * np.bincount(np.r_[first, last], minlength=n)  # a face is half a voxel away
     source = np.zeros(n)
     source[first] = 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 import recon
@@ -21,7 +23,7 @@ from beamline.storage.readers.open import open_scan, scan_format
 from beamline.storage.volumes.files import opened_volume
 from recon import Grid, Volume
 from recon.post import clusters
-from splatline_structure.materials import F32
+from splatline_structure.materials import F32, Spacing
 
 Box = tuple[slice, slice, slice]
 _BESIDE = 16  # slices beside those that are looked at, which the prior of a method takes in
@@ -56,16 +58,19 @@ class ReadSlices:
 def read_volume(
     path: Path,
     dataset: str | None,
-    voxel_um: float | None,
+    voxel_um: Spacing | None,
     slices: tuple[int, int] | None,
     memory: int,
     crop: bool,
     whole: bool = False,
+    warn: Callable[[str], None] = lambda sentence: None,
 ) -> ReadSlices:
     """The slices of a volume, or as many of them in the middle as fit the memory.
 
     Args:
+        voxel_um: edges of a voxel (z, y, x); None: the file's.
         whole: all slices that are asked for, or none.
+        warn: is told where the file states other edges.
 
     Raises:
         DataError: no volume of finite numbers, no size of a voxel, no such slices, or one of which fewer than 8 slices,
@@ -76,10 +81,28 @@ def read_volume(
             f"{path} is a scan ({scan}): reconstruct it with `beamline recon`; if it is a volume, give --dataset. "
             "Nothing was written."
         )
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as packed:
+            unpacked = sum(each.file_size for each in packed.infolist())
+        if unpacked > memory:
+            raise DataError(
+                f"{path} unpacks to {size(unpacked)}, and {size(memory)} may be used: give more --memory, or save the "
+                "volume as .npy (numpy.save), which is read slice by slice. Nothing was written."
+            )
     with opened_volume(path, dataset) as record:
-        grid = record.volume.grid if voxel_um is None else Grid(record.volume.grid.shape, voxel_um * 1e-3)
+        grid = record.volume.grid
         if voxel_um is None and record.length_unit != "mm":
-            raise DataError(f"{path} does not state the size of a voxel: give --voxel-um. Nothing was written.")
+            raise DataError(
+                f"{path} does not state the size of a voxel: give --voxel-um EDGE, or Z:Y:X if voxels are not cubes. "
+                "Nothing was written."
+            )
+        if voxel_um is not None:
+            if record.length_unit == "mm" and not np.allclose(voxel_um, stated := 1e3 * np.array(grid.spacing), 0.01):
+                warn(
+                    f"{path} states voxels of {_edges(stated)} µm (z x y x x), which are not those of --voxel-um: "
+                    f"{_edges(voxel_um)} µm are taken."
+                )
+            grid = Grid(grid.shape, voxel_um[2] * 1e-3, slice_pitch=voxel_um[0] * 1e-3)
         n_slices = grid.shape[0]
         first, end = slices or (0, n_slices)
         if not 0 <= first < end <= n_slices:
@@ -114,6 +137,10 @@ def read_volume(
             raise DataError(f"{path} has values that are not finite. Nothing was written.")
         record = replace(record, volume=Volume(values, grid), length_unit="mm", deviation=None, series=None)
         return ReadSlices(record, fitting, slice(first, end), n_slices, limit_sentence)
+
+
+def _edges(spacing: ArrayLike) -> str:
+    return " x ".join(f"{edge:.4g}" for edge in np.asarray(spacing))
 
 
 def slabs_of(

@@ -148,15 +148,15 @@ def test_a_scan_is_refused_and_what_is_to_be_done_is_named(here: Path) -> None:
 def test_a_volume_that_is_laid_out_as_a_scan_is_read_by_its_name(here: Path) -> None:
     with h5py.File(here / "volume.h5", "w") as file:
         file["exchange/data"] = np.zeros((9, 10, 11), np.float32)
-    read = read_volume(here / "volume.h5", "exchange/data", 2, None, 10**9, True)
+    read = read_volume(here / "volume.h5", "exchange/data", (2, 2, 2), None, 10**9, True)
     assert read.record.grid.shape == (9, 10, 11)
     with pytest.raises(DataError, match="if it is a volume, give --dataset"):
-        read_volume(here / "volume.h5", None, 2, None, 10**9, True)
+        read_volume(here / "volume.h5", None, (2, 2, 2), None, 10**9, True)
 
 
 def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(here: Path) -> None:
     np.save(here / "v.npy", np.random.default_rng(0).random((10, 48, 48), np.float32))
-    read = read_volume(here / "v.npy", None, 2, None, 10**9, True)
+    read = read_volume(here / "v.npy", None, (2, 2, 2), None, 10**9, True)
     read = replace(read, record=replace(read.record, parameters={"axis_col": 23.5}))
     with pytest.raises(ValueError, match=r"has 10 slices, but rows 0:16 of its scan give 16: give --parts or --quick"):
         parts_of(read, here / "scan.h5", 2, pytest.fail, lambda *_: None)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.measure import marching_cubes, mesh_surface_area, regionprops
 
-from splatline_structure.materials import labelled, materials_of, probabilities
+from splatline_structure.materials import label_values, labelled, materials_of, probabilities
 from splatline_structure.numbers import Rules, coarse, structure_of
 from splatline_structure.particles import cleaned, measured, parted, surfaces
 from splatline_structure.transport import connecting, tortuosity
@@ -174,3 +174,31 @@ def test_three_materials_are_numbered_from_the_least_dense_on() -> None:
 def test_voxels_twice_as_wide_are_means() -> None:
     fine = np.arange(5 * 4 * 4, dtype=np.float32).reshape(5, 4, 4)
     assert coarse(fine).shape == (2, 2, 2) and coarse(fine)[0, 0, 0] == pytest.approx(fine[:2, :2, :2].mean())
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_thick_slices_are_voxels_that_conduct_by_their_edges(axis: int) -> None:
+    mask = blobs(24, 2)
+    fine, turned = mask.repeat(3, axis=0), np.swapaxes(mask, 0, 1)
+    found = tortuosity(mask, axis, (3, 1, 1))
+    assert found == pytest.approx(tortuosity(fine, axis), rel=0.08)
+    assert found == pytest.approx(tortuosity(turned, (1, 0, 2)[axis], (1, 3, 1)), rel=1e-3)
+    assert abs(tortuosity(mask, axis) / found - 1) > 0.03  # what cubes would have
+
+
+def test_particles_in_thick_slices_are_those_in_cubes() -> None:
+    shape, balls = (48, 48, 48), (((22, 14, 14), 10), ((22, 34, 14), 10.5), ((24, 30, 36), 9))
+    fine = np.logical_or.reduce([away(at, shape) < r for at, r in balls])
+    cubes, slabs = (
+        measured(parted(cleaned(mask, 1, 27, edges), NECK, edges), edges)
+        for mask, edges in ((fine, (1.0, 1.0, 1.0)), (fine[1::3], (3.0, 1.0, 1.0)))
+    )
+    assert cubes.label.size == slabs.label.size == 3
+    np.testing.assert_allclose(np.sort(slabs.diameter), np.sort(cubes.diameter), rtol=0.03)
+
+
+def test_labels_are_their_own_levels() -> None:
+    labels = np.random.default_rng(0).integers(0, 3, (12, 12, 12)).astype(np.float32)
+    assert materials_of(labels, 3).levels.tolist() == [0, 1, 2]
+    assert label_values(labels).tolist() == [0, 1, 2] and not label_values(grains()).size
+    assert not label_values(np.ones((4, 4, 4), np.float32)).size

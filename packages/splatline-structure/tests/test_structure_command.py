@@ -88,7 +88,7 @@ def test_halves_of_the_views_are_part_of_the_interval(here: Path) -> None:
     result = beamline(*common, "--parts", "a.npy", "b.npy", "-o", "parts")
     assert result.exit_code == 0, result.output
     quick, parts = ({row["number"]: row for row in _rows(here / name / "numbers.csv")} for name in ("quick", "parts"))
-    assert quick["surface"]["views"] == "nan" and float(parts["surface"]["views"]) > 0
+    assert quick["surface"]["views"] == "" and float(parts["surface"]["views"]) > 0
     assert quick["surface"]["value"] == parts["surface"]["value"]
     width = {
         name: float(row["surface"]["high"]) - float(row["surface"]["low"]) for name, row in (("q", quick), ("p", parts))
@@ -166,7 +166,7 @@ def test_without_contrast_in_the_middle_these_slices_are_named(here: Path) -> No
 
 def test_halves_are_cut_to_the_slices_that_are_measured_or_hold_these_alone(here: Path) -> None:
     np.save(here / "middle.npy", can()[11:28])
-    read = volumes.read_volume(Path("can.npy"), None, 10, (11, 28), 10**9, True)
+    read = volumes.read_volume(Path("can.npy"), None, (10, 10, 10), (11, 28), 10**9, True)
     halves = command._parts(Path("can.npy"), read, None, quick=False, parts=(Path("can.npy"), Path("middle.npy")))
     for half in halves:
         np.testing.assert_array_equal(half, can()[11:28])
@@ -252,6 +252,10 @@ REFUSED = [
     (("even.npy", *VOXEL_UM), 5, "even.npy cannot be measured"),
     (("noise.npy", *VOXEL_UM), 5, "near the rarer one; reconstruct from more views. Nothing"),
     (("can.npy",), 5, "does not state the size of a voxel: give --voxel-um"),
+    (("can.npy", "--voxel-um", "nan"), 2, "expected the edge of a voxel in µm"),
+    (("can.npy", "--voxel-um", "3:2:1"), 2, "pixels of a slice are squares"),
+    (("labels.npy", *VOXEL_UM, "--materials", "2"), 5, "which are labels, not grey values"),
+    (("big.npz", *VOXEL_UM, "--memory", "10K"), 5, "unpacks to 830 kB, and 10 kB may be used"),
     (("holes.npy", *VOXEL_UM), 5, "values that are not finite"),
     (("small.npy", *VOXEL_UM), 5, "expected 8 or more voxels a side"),
     (("can.npy", *VOXEL_UM, "--slices", "3", "99"), 5, "has slices 0 to 40"),
@@ -275,6 +279,8 @@ REFUSED = [
 def test_what_has_no_numbers_is_refused_and_nothing_is_written(
     here: Path, arguments: tuple[str, ...], code: int, words: str
 ) -> None:
+    np.save(here / "labels.npy", np.arange(4000).reshape(10, 20, 20) % 3)
+    np.savez_compressed(here / "big.npz", volume=np.zeros((40, 72, 72), np.float32))
     np.save(here / "even.npy", np.ones((10, 12, 12), np.float32))
     np.save(here / "noise.npy", np.random.default_rng(0).normal(1, 0.1, (20, 30, 30)).astype(np.float32))
     np.save(here / "holes.npy", np.where(can() > 1, np.nan, can()))
@@ -293,6 +299,18 @@ def test_a_particle_larger_than_the_field_and_no_path_are_words(here: Path) -> N
     result = beamline("structure", "plate.npy", *VOXEL_UM, "--quick", "--crop", "none", "--side", "20")
     assert result.exit_code == 0, result.output
     assert "there is no whole particle in the field" in result.stdout and "nothing connects the faces" in result.stdout
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_labels_edges_and_options_are_said_back(here: Path) -> None:
+    np.savez(here / "three.npz", labels=np.floor(can() * 0.9).clip(0, 1).astype(np.uint8), voxel_mm=0.01, slice_mm=0.03)
+    words = ("structure", "three.npz", "--voxel-um", "10", "--quick", "--crop", "none", "--side", "1", "-o", "o")
+    result = beamline(*words)
+    assert result.exit_code == 0, result.output
+    assert "states voxels of 30 x 10 x 10 µm" in result.stderr
+    assert "is taken as labels, not as grey values: 0, 1 are materials 1 to 2" in result.stderr
+    settings = json.loads((here / "o/structure.json").read_text(encoding="utf-8"))
+    assert " ".join(words) in json.dumps(settings)
 
 
 def test_the_former_name_says_what_to_use(here: Path) -> None:

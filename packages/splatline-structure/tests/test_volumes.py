@@ -43,7 +43,7 @@ def test_slabs_of_a_volume_larger_than_the_memory_are_all_slices_and_are_counted
 ) -> None:
     path, counted = tmp_path / "can.npy", list[tuple[int, int]]()
     np.save(path, can())
-    read = read_volume(path, None, 10, slices, 13_300_000, True)
+    read = read_volume(path, None, (10, 10, 10), slices, 13_300_000, True)
     first, end = slices or (0, 40)
     assert (read.slices, read.asked, read.n_slices) == (read_slices, slice(first, end), 40)
     assert "Free memory or give more --memory to measure more slices." in read.limit_sentence

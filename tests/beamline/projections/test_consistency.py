@@ -17,6 +17,7 @@ from tests.beamline.array_source import ArraySource
 from tests.beamline.prepared_views import prepare
 from tests.bench.clean_scans import lines_of
 from tests.recon.prep.balls import Balls
+from tests.recon.prep.test_fan import views as fan_views
 from tests.recon.prep.test_repeats import BALLS, shrinks
 
 ANGLES, AXIS = np.linspace(0, np.pi, 45, endpoint=False), 36.8
@@ -76,3 +77,15 @@ def test_a_faint_sample_that_shrinks_is_told_by_views_of_the_same_rays() -> None
     assert told(still + noise, angles=twice) == []
     (sentence,) = told(smaller + noise, angles=twice)
     assert "see the same rays" in sentence and "narrower" in sentence
+
+
+def test_a_cone_that_is_not_stated_is_told_and_parallel_rays_are_not() -> None:
+    for degrees, expected in ((0.0, 0), (17.0, 1)):
+        sinogram, angles = fan_views(np.tan(np.radians(degrees / 2)) / 48)
+        views = np.repeat(sinogram[:, None] / 100, 12, axis=1)
+        source = ArraySource(views.astype(np.float32), [0] * len(views), angles)
+        source.quantity = "line_integrals"
+        _, sentences = prepare(source, Selection(axis_col=47.5))
+        told_of = [sentence for sentence in sentences if "disagree with the stated geometry" in sentence]
+        assert len(told_of) == expected, sentences
+        assert not told_of or "instead of 0. If the beam is a cone, give --cone SOD:SDD" in told_of[0]

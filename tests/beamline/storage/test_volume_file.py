@@ -117,3 +117,28 @@ def test_what_is_no_volume_file_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"no volume at all, but some text that is long enough for a header")
     with pytest.raises(DataError, match=r"cannot be read|not a readable|not a known volume file|HDF5"):
         read_volume(tmp_path / name)
+
+
+@pytest.mark.parametrize(("unit", "edge"), [("micron", 1.0), ("\\u00B5m", 1.0), ("nm", 1000.0), ("mm", 0.001)])
+def test_fiji_states_the_edges_of_a_voxel(tmp_path: Path, unit: str, edge: float) -> None:
+    facts = {"axes": "ZYX", "spacing": 3 * edge, "unit": unit}
+    tifffile.imwrite(
+        tmp_path / "v.tif", np.ones((4, 5, 6), np.float32), imagej=True, resolution=(1 / edge,) * 2, metadata=facts
+    )
+    values, spacing = read_volume(tmp_path / "v.tif")
+    assert values.shape == (4, 5, 6) and spacing == pytest.approx((0.003, 0.001, 0.001), rel=1e-3)
+
+
+def test_ome_states_the_edges_of_a_voxel_and_a_bare_tiff_none(tmp_path: Path) -> None:
+    edges = {"PhysicalSizeX": 0.5, "PhysicalSizeY": 0.5, "PhysicalSizeZ": 2.0, "PhysicalSizeZUnit": "µm"}
+    tifffile.imwrite(
+        tmp_path / "v.ome.tif",
+        np.ones((4, 5, 6), np.uint16),
+        photometric="minisblack",
+        metadata={"axes": "ZYX", **edges},
+    )
+    assert read_volume(tmp_path / "v.ome.tif")[1] == pytest.approx((0.002, 0.0005, 0.0005))
+    tifffile.imwrite(
+        tmp_path / "bare.tif", np.ones((4, 5, 6), np.uint16), photometric="minisblack", resolution=(72, 72)
+    )
+    assert read_volume(tmp_path / "bare.tif")[1] is None

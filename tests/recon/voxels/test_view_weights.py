@@ -144,6 +144,27 @@ def test_a_real_wedge_is_missed_however_dense_the_views(span: float, n: int) -> 
     np.testing.assert_allclose(angular_weights(angles), np.deg2rad(span / n), rtol=1e-9)
 
 
+def test_gaps_between_groups_are_sampling_and_lose_no_density() -> None:
+    """Views in groups, a part repeated finely, turns that nearly repeat: also for the slices that some of them see."""
+    even = np.arange(0, 180, 2.0)
+    groups = np.concatenate([18 * k + 0.5 * np.arange(12) for k in range(20)])
+    finely = np.sort(np.concatenate((even, np.arange(0.01, 20, 0.02))))
+    for degrees in (groups, finely, np.arange(0, 12 * 360, 7.013)):
+        weights = angular_weights(np.radians(degrees))
+        assert weights.sum() == pytest.approx(np.pi) and weights.max() < np.radians(13)
+        assert angular_weights(np.radians(degrees[1:]), np.radians(degrees)).sum() == pytest.approx(np.pi)
+    assert circle_weights(np.radians(groups)).sum() == pytest.approx(2 * np.pi)
+    geometry = Geometry.parallel(np.radians(groups), (1, 64))
+    shown = fbp(disc_views(geometry, 20, (0.0, 0.0)), geometry, Grid((1, 64, 64)), "hann")[0]
+    assert shown[22:42, 22:42].mean() == pytest.approx(1, abs=0.01)
+
+
+def test_two_missing_sectors_are_missed_however_wide() -> None:
+    for far in (20, 50, 70):
+        degrees = np.concatenate((np.arange(0, 90 - far, 0.5), np.arange(90, 180 - far, 0.5)))
+        assert np.degrees(angular_weights(np.radians(degrees)).sum()) == pytest.approx(180 - 2 * far, abs=0.1)
+
+
 @pytest.mark.parametrize("angles", [[], [0.0, np.nan]])
 def test_weights_of_no_angle_are_refused(angles: list[float]) -> None:
     with pytest.raises(ValueError, match="at least one angle"):
@@ -201,6 +222,8 @@ def test_what_a_short_scan_lacks_is_said_in_degrees(arc: float, lacking: float) 
             cone_weights(geometry)
     gaps = Geometry.fan([0, 0.1, 0.2, 0.3, 0.4, 2.0, 2.1, 2.2, 2.3, 4.0], 41, 1.0, 150.0, 300.0)
     assert missing_arc(gaps) == np.inf
+    with pytest.raises(ValueError, match=r"leave several gaps"):
+        cone_weights(gaps)
 
 
 def test_the_wedge_is_what_no_view_sees() -> None:

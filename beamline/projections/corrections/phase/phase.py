@@ -201,6 +201,8 @@ class Phase:
             )
         mask = "" if paganin.unsharp is None else "; unsharp mask of {:g} px by {:g}".format(*paganin.unsharp)
         sentence = f"Phase: Paganin's filter over {paganin.length:.3g} pixels ({sentence}){mask}."
+        if paganin.length < 1:
+            sentence += " It is shorter than a pixel and changes next to nothing: check energy, distance, pixel size."
         return paganin, f"{sentence} {self.explanation}".rstrip()
 
 

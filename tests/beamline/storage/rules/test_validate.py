@@ -288,3 +288,5 @@ def test_uneven_angles_over_half_a_turn_are_no_limited_angle(views: int) -> None
         for degrees in (kept, kept + 70, np.where(kept > 40, kept + lost, kept), np.where(kept > 40, kept + 180, kept)):
             step = (180 - lost) / (views - 1)
             assert half_turn_unseen(np.radians(degrees)) == pytest.approx(lost, abs=step + 1e-6)
+    for degrees in (np.r_[0:40:0.5, 90:130:0.5], np.r_[0:20:0.5, 90:110:0.5]):  # twice the same gap
+        assert half_turn_unseen(np.radians(degrees)) == pytest.approx(180 - degrees.size / 2, abs=0.1)
