@@ -159,7 +159,7 @@ def side_of(source: ScanSource) -> SideFile | None:
         return None
     views, found = source.table.views.size, []
     for path in _candidates(source.path):
-        with suppress(DataError):
+        with suppress(Exception):  # what is only looked at, for an offer, stops no scan, whatever it holds
             found.append(read_side_file(path))
     found = [side for side in found if side.count == views]
     return found[0] if len(found) == 1 else None
@@ -175,7 +175,7 @@ def _candidates(scan: Path) -> Iterator[Path]:
     suffixes, n = {keys.suffix for keys in MAKERS}, 0
     for folder in (scan, scan.parent) if scan.is_dir() else (scan.parent,):
         for path in sorted(folder.glob("*.*")):
-            if path.suffix.lower() in suffixes and n < _MOST and path.is_file():
+            if path.suffix.lower() in suffixes and n < _MOST:
                 n += 1
                 yield path
 
@@ -191,7 +191,7 @@ def _values(path: Path) -> dict[str, str]:
         _of_json(json.loads(text), "", values)
     else:
         parser = configparser.RawConfigParser(strict=False, allow_no_value=True, delimiters=("=",))
-        parser.read_string(text.lstrip("\ufeff"))
+        parser.read_string("\n".join(map(str.strip, text.splitlines())))  # indented lines continue none
         values = {
             f"{section}/{key}".lower(): value or "" for section in parser for key, value in parser[section].items()
         }
@@ -230,13 +230,17 @@ def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str
     return {name: number and float(number[0]) for name, number in zip(names, numbers, strict=True)}
 
 
+_NEEDED = "sod", "sdd", "pixel", "count"
+_LARGEST = 1e7  # of these numbers: no scan has as many projections, and no distance is as long in mm
+
+
 def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
     number = _numbers(path, keys, values)
     if other := next((key for key in keys.helix if values.get(key, "").lower() == "true"), ""):
         raise DataError(f"{path} says {other}: only scans on a circle are supported.")
-    sod, sdd, pixel, count = (number[name] or 0.0 for name in ("sod", "sdd", "pixel", "count"))
-    if lacking := [getattr(keys, name) for name in ("sod", "sdd", "pixel", "count") if not (number[name] or 0) > 0]:
-        raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers.")
+    sod, sdd, pixel, count = (number[name] or 0.0 for name in _NEEDED)
+    if lacking := [getattr(keys, name) for name in _NEEDED if not 0 < (number[name] or 0) < _LARGEST]:
+        raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers below {_LARGEST:g}.")
     pixel *= keys.unit * (sdd / sod if keys.at_sample else 1.0)
     n, scale = int(count), number["scale"] or 1.0
     angles = _degrees(path, keys, number, n)

@@ -73,6 +73,42 @@ def images(tmp_path: Path) -> Path:
     return folder
 
 
+_OF_A_SCRIPT = """[2026-05-03 10:12:01] scan begins
+exposure 0.1 s
+Traceback (most recent call last):
+  File "scan.py", line 212, in take
+TimeoutError: no frame
+"""
+TEXTS = {
+    "s.log": _OF_A_SCRIPT.encode(),
+    "settings.log": b"[Scan]\nSample\n  name: cell\n  mounted by: AB\n",
+    "s.xtekct": b"\xff\xfe[\x00X\x00",
+    "x.pca": b"[\x00\x01]\n\x02\n  \x03\n",
+    "y.pca": b'{"a": [1, {"b": 2}], "geometry": 3}',
+    "deep.pca": b'{"a":' * 3000 + b"1" + b"}" * 3000,
+    "deep.xml": b"<a>" * 3000 + b"</a>" * 3000,
+    "empty.log": b"",
+    "endless.pca": PHOENIX.replace(f"={N}", "=1e999").encode(),
+    "many.pca": PHOENIX.replace(f"={N}", "=9e11").encode(),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+@pytest.mark.parametrize("above", [False, True])
+def test_any_text_beside_images_stops_no_scan(images: Path, name: str, above: bool) -> None:
+    (images.parent / name if above else images / name).write_bytes(TEXTS[name])
+    with open_scan(images) as source:
+        assert len(source.table) == N
+        assert source.not_used == ()
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_any_text_that_is_named_is_refused_in_a_sentence(images: Path, name: str) -> None:
+    (images / name).write_bytes(TEXTS[name])
+    with pytest.raises(DataError, match=r"cannot be read as|is not a supported file|states no"):
+        read_side_file(images / name)
+
+
 @pytest.mark.parametrize("name", ["s.log", "s.xtekct", "s.pca"])
 def test_decimal_commas_are_read(images: Path, name: str) -> None:
     text = FILES[name][0].replace("=60\n", "=60.5\n").replace("60.000", "60.500").replace("=0.04", "=0.0417")
