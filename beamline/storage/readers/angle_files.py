@@ -217,11 +217,19 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
             f"{angles.size}, the first {lost} or the last {lost} may be lost"
         )
     if angles.size < n:
-        return f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order."
+        return (
+            f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order. Images "
+            "among them that are darks or flats are given with --darks and --flats, or named by --frames."
+        )
     sinograms, window = "", evenly_spaced_window(angles, n)
     if angles.size in source.shape:
         order = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
         sinograms = f"If each image is a sinogram of {angles.size} views, say --order {order}; if not, say"
+        if not source.table.are_views.all():
+            sinograms = (
+                f"If an image is a sinogram of {angles.size} views, give it alone as FILE, and the others with --darks "
+                "and --flats; if not, say"
+            )
     message += (
         f". {sinograms or 'Say'} with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
     )

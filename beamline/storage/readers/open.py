@@ -37,6 +37,7 @@ from beamline.storage.readers.transforms import (
     cropped,
     in_parts,
     kinds_and_views,
+    only_left_out,
     real_type,
     selected,
     turned,
@@ -174,7 +175,8 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
     """The frames of all files, of the kinds that the caller says."""
     kinds, _ = kinds_and_views(options.frames)
     own_angles, given = options.angles is None and options.angles_path is None, (options.darks, options.flats)
-    opening = Opening(follow, own_angles, kinds is not None, options.quantity == "counts" and given == (None, None))
+    own_kinds = kinds is not None and not only_left_out(kinds)
+    opening = Opening(follow, own_angles, own_kinds, options.quantity == "counts" and given == (None, None))
     with ExitStack() as opened:
 
         def file(path: Path) -> ScanSource:

@@ -68,7 +68,8 @@ def stated_references(
     if base.dtype.kind != "f":
         raise DataError(
             f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
-            "stands for 1, give it as --flats 65535 or the like, with --darks 0, and leave out --quantity."
+            "stands for 1, such as 65535, or the counts of air beside the sample, give it: --flats 65535 --darks 0, "
+            "without --quantity."
         )
     return nothing, np.ones_like(nothing)
 

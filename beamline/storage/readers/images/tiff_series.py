@@ -35,7 +35,7 @@ from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.packing import packing
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.frames import Frames
-from beamline.storage.readers.images.image_names import NamedImages, in_order
+from beamline.storage.readers.images.image_names import NamedImages, in_order, places_of
 from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.side_files import offered
 from beamline.storage.readers.tiff import (
@@ -100,7 +100,8 @@ class TiffSeriesSource(ScanSource):
         self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
         if images.half_turn:
             self.not_used += (NotUsed(images.half_turn[0], count(len(images.half_turn), "image"), _BESIDE, False),)
-        self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
+        self.facts = {"series": f"{series[0]} ... {series[-1]}", "places": places_of(images.names)}
+        self.facts |= {"missing_numbers": gaps} if gaps else {}
         if np.isfinite(self.table.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
         if images.doubt:
@@ -307,7 +308,7 @@ def _open(path: Path, opening: Opening) -> ScanSource:
 
 def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
     """The scan of the folder above, where its views are those of this one, and others are darks or flats."""
-    with suppress(DataError):
+    with suppress(Exception):  # what lies there is only looked at, and may be anything
         above = TiffSeriesSource(source.path.absolute().parent)
         views = [Path(above.names[i]).parts[0] for i in above.table.views]
         beside = sorted({Path(name).parts[0] for name in above.names} - {*views})
