@@ -108,7 +108,7 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
     options = {
         name_of(option): option
         for option in ctx.command.params
-        if isinstance(option, click.Option) and not _is_of_one_call(option)
+        if isinstance(option, click.Option) and (not _is_of_one_call(option) or getattr(option, _GROUP, "") == DATA)
     }
     former = {
         option.former.lstrip("-"): option

@@ -1,6 +1,7 @@
 """Files that makers of CT scanners write beside their images: distances, pixel size, angles and white level.
 
-Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON and the .xml of Diondo, by keys that
+Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON, the .xml of Diondo and
+the "data settings XRE.txt" of TESCAN (FleXray), by keys that
 public readers use (TIGRE, CIL). A key that is not there is not guessed.
 """
 
@@ -37,7 +38,7 @@ class MakerKeys:
         pixel: width of a pixel in mm, times `unit`; at the sample where `at_sample`.
         count: of the projections.
         step, span: degrees from one to the next, or of all.
-        first: degrees of the first one.
+        first, last: degrees of the first one, and of the last.
         white: counts of the open beam.
         scale: a factor of both distances.
         helix: keys that say "true" where the source goes round on another path than a circle.
@@ -54,11 +55,13 @@ class MakerKeys:
     step: str = ""
     span: str = ""
     first: str = ""
+    last: str = ""
     white: str = ""
     scale: str = ""
     helix: tuple[str, ...] = ()
 
 
+_XRE = "ct-parameters in/"
 _YXLON = "conebeamscanparameter/scantrajectory/"
 MAKERS = (
     MakerKeys(
@@ -82,6 +85,10 @@ MAKERS = (
     MakerKeys(
         "Diondo", ".xml", "geometrie/sourceobjectdist", "geometrie/sourcedetectordist", "recon/projectionpixelsizex",
         "recon/projectioncount", helix=("scanparameter/helixmode", "scanparameter/laminography"),
+    ),
+    MakerKeys(
+        "TESCAN", ".txt", f"{_XRE}sod", f"{_XRE}sdd", f"{_XRE}pixel size", f"{_XRE}projections",
+        first=f"{_XRE}start angle", last=f"{_XRE}last angle",
     ),
 )  # fmt: skip
 _ROUND = {"Diondo": 360.0}  # degrees of the scans of a maker whose file states none
@@ -191,9 +198,12 @@ def _values(path: Path) -> dict[str, str]:
         _of_json(json.loads(text), "", values)
     else:
         parser = configparser.RawConfigParser(strict=False, allow_no_value=True, delimiters=("=",))
-        parser.read_string("\n".join(map(str.strip, text.splitlines())))  # indented lines continue none
+        lines = "\n".join(map(str.strip, text.splitlines()))  # indented ones continue none
+        parser.read_string(lines.replace("\n# projections", "\nprojections"))  # a key of TESCAN's, no comment
         values = {
-            f"{section}/{key}".lower(): value or "" for section in parser for key, value in parser[section].items()
+            f"{section}/{key}".lower(): (value or "").strip('"')
+            for section in parser
+            for key, value in parser[section].items()
         }
     return values
 
@@ -221,7 +231,7 @@ def _of_json(item: Any, path: str, values: dict[str, str]) -> None:
 
 def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str, float | None]:
     """The number at the beginning of the text of each key, by the names in MakerKeys; None for a text without one."""
-    names = ("sod", "sdd", "pixel", "count", "step", "span", "first", "white", "scale")
+    names = ("sod", "sdd", "pixel", "count", "step", "span", "first", "last", "white", "scale")
     texts = [values.get(getattr(keys, name), "") for name in names]
     try:
         numbers = (re.match(rf"\s*[-+]?{NUMBER}", text) for text in with_points(texts))
@@ -253,6 +263,8 @@ def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n:
     if keys.maker == "Nikon" and (listed := _listed_angles(path, n)) is not None:
         return listed
     step, span = number["step"], number["span"] or _ROUND.get(keys.maker)
+    if number["last"] is not None and n > 1:
+        step = (number["last"] - (number["first"] or 0.0)) / (n - 1)
     if step is None and span is not None:
         step = span / n
     return None if step is None else (number["first"] or 0.0) + step * np.arange(n, dtype=np.float64)

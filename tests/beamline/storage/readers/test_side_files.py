@@ -54,7 +54,18 @@ YXLON = f"""<?xml version="1.0"?>
 DIONDO = f"""<Scan><ScanParameter><HelixMode>false</HelixMode><Laminography>false</Laminography></ScanParameter>
 <Geometrie><SourceDetectorDist>300</SourceDetectorDist><SourceObjectDist>60</SourceObjectDist></Geometrie>
 <Recon><ProjectionPixelSizeX>0.2</ProjectionPixelSizeX><ProjectionCount>{N}</ProjectionCount></Recon></Scan>"""
+TESCAN = f"""[General]
+Project = "walnut"
+[CT-parameters IN]
+SOD = "60.000000"
+SDD = "300.000000"
+Pixel size = "0.200000"
+Start angle = "10.000000"
+Last angle = "310.000000"
+# projections = "{N}"
+"""
 FILES = {
+    "data settings XRE.txt": (TESCAN, 10.0),
     "s.xtekct": (NIKON, 10.0),
     "s.log": (SKYSCAN, 0.0),
     "s.pca": (PHOENIX, 0.0),
