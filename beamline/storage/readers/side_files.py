@@ -172,6 +172,14 @@ def side_of(source: ScanSource) -> SideFile | None:
     return found[0] if len(found) == 1 else None
 
 
+def reconstructed_pixel_mm(log: Path) -> float | None:
+    """Edge of a voxel in mm by the log that NRecon writes beside its slices; None where it states none."""
+    with suppress(Exception):  # whatever the log of another program holds
+        edge = float(with_points([_values(log)["reconstruction/pixel size (um)"]])[0]) * 1e-3
+        return edge if 0 < edge < _LARGEST else None
+    return None
+
+
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
     """A sentence on what a vendor's file beside these images states."""
     side = side_of(source)

@@ -61,11 +61,13 @@ def read_volume(
     memory: int,
     crop: bool,
     whole: bool = False,
+    finite: bool = False,
 ) -> ReadSlices:
     """The slices of a volume, or as many of them in the middle as fit the memory.
 
     Args:
         whole: all slices that are asked for, or none.
+        finite: the caller looks at finite values alone.
 
     Raises:
         DataError: no volume of finite numbers, no size of a voxel, no such slices, or one of which fewer than 8 slices,
@@ -110,8 +112,11 @@ def read_volume(
             raise DataError(
                 f"{path} holds {values.shape}; expected {_LEAST} or more voxels a side. Nothing was written."
             )
-        if not np.isfinite(values).all():
-            raise DataError(f"{path} has values that are not finite. Nothing was written.")
+        if not finite and (share := 1 - np.isfinite(values).mean()):
+            raise DataError(
+                f"{path} has values that are not finite, {share:.2%} of its voxels. If they lie outside the circle of "
+                "the field, --crop finite measures the square inside it. Nothing was written."
+            )
         record = replace(record, volume=Volume(values, grid), length_unit="mm", deviation=None, series=None)
         return ReadSlices(record, fitting, slice(first, end), n_slices, limit_sentence)
 
@@ -141,15 +146,24 @@ def slabs_of(
             tell(taken, len(slabs))
 
 
-def box_in(volume: F32, crop: bool) -> Box:
+def box_in(volume: F32, crop: bool, finite: bool = False) -> Box:
     """The square inside the circle of the sample, or of the field where the sample is wider; or all.
 
+    Args:
+        finite: the square inside the circle that has finite values in all slices.
+
     Raises:
-        ValueError: the volume is the same everywhere.
+        ValueError: the volume is the same everywhere, or has values in the square that are not finite.
     """
     nz, ny, nx = volume.shape
     if not crop:
         return slice(0, nz), slice(0, ny), slice(0, nx)
+    known = np.isfinite(volume).all(axis=0)
+    if finite and not known.all():
+        box = inscribed_box((nz, ny, nx), sample_circle(known[None].astype(np.float32)), 0.0)
+        if not known[box[1:]].all():
+            raise ValueError("it has values that are not finite, and they are not those outside a circle")
+        return box
     y, x = (np.arange(n) - (n - 1) / 2 for n in (ny, nx))
     away, field = np.hypot(y[:, None], x), min(ny, nx) / 2
     mean = volume.mean(axis=0)

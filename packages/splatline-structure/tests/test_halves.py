@@ -98,7 +98,7 @@ def test_intervals_against_views_are_wider_for_fewer_in_one_box_about_one_axis(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     boxes, axes, reconstruct = [], [], api.reconstruct
-    monkeypatch.setattr(volumes, "box_in", lambda volume, crop: boxes.append(box_in(volume, crop)) or boxes[0])
+    monkeypatch.setattr(volumes, "box_in", lambda *how: boxes.append(box_in(*how)) or boxes[0])
     monkeypatch.setattr(
         api, "reconstruct", lambda *at, **of: axes.append(of["selection"].axis_col) or reconstruct(*at, **of)
     )
