@@ -27,7 +27,7 @@ from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.orders import with_order
-from beamline.storage.readers.reference_files import Images, load_images, overlaid, stated_references
+from beamline.storage.readers.reference_files import Images, load_images, overlaid, places_of_flats, stated_references
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
 from beamline.storage.readers.stacks import datasets_text, open_stacks
 from beamline.storage.readers.tiff import FOREIGN, no_image
@@ -246,6 +246,7 @@ def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | 
         darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
         flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
         quantity="counts" if quantity == "transmission" else quantity,
+        places=places_of_flats(flats, base.shape),
     )
 
 
