@@ -231,7 +231,10 @@ def _counting(names: list[str]) -> list[int] | None:
     counting = [n for n in varying if len(set(columns[n])) == len(names)]
     dates = {n for n in varying if min(columns[n]) >= _DATE}
     if not counting or set(varying) - {*counting} - dates:
-        return None
+        decimals = [re.findall(r"\d+[.,]\d+", name) for name in names]
+        values = [float(each[0].replace(",", ".")) for each in decimals if len(each) == 1]
+        ranks = np.unique(values, return_inverse=True)[1].tolist()
+        return ranks if len({*ranks}) == len(names) else None  # such as angles: they tell the order alone
     return columns[min(counting, key=lambda n: (max(columns[n]) - min(columns[n]), columns[n], -n))]
 
 
