@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from can_of_balls import BALLS, CIRCLE, SHAPE, WALL, can, inside
 
+from beamline.core.errors import DataError
 from splatline_structure.materials import materials_of
 from splatline_structure.numbers import Rules, structure_of
 from splatline_structure.volumes import box_in, inscribed_box, read_volume, sample_circle, slabs_of
@@ -73,3 +74,20 @@ def test_balls_in_a_can_are_found_with_number_volume_and_place(noise: float) -> 
         assert structure.numbered[tuple(np.round(particles.centroid[nearest]).astype(int))] == particles.label[nearest]
     assert {len(each) for each in particles.neighbours} == {0, 1}  # two of them touch
     assert inside(known[0][0], known[0][1])[box][structure.numbered > 0].any()
+
+
+def test_a_volume_that_is_not_finite_outside_a_circle_is_measured_inside_it(tmp_path: Path) -> None:
+    volume = np.random.default_rng(0).random((10, 72, 72)).astype(np.float32)
+    y, x = np.mgrid[:72, :72] - 35.5
+    volume[:, np.hypot(y, x) > 35] = np.nan
+    np.save(tmp_path / "v.npy", volume)
+    for crop in (True, False):
+        with pytest.raises(DataError, match=r"not finite, 2\d\.\d+% .*--crop finite"):
+            read_volume(tmp_path / "v.npy", None, 1, None, 10**9, crop)
+    read = read_volume(tmp_path / "v.npy", None, 1, None, 10**9, True, finite=True)
+    box = box_in(read.record.volume.data, True, True)
+    assert np.isfinite(volume[box]).all() and box[1] == box[2] and box[1].stop - box[1].start in range(47, 52)
+    volume[3, 36, 36] = np.inf
+    with pytest.raises(ValueError, match="not those outside a circle"):
+        box_in(volume, True, True)
+    np.testing.assert_equal(box_in(np.nan_to_num(volume), True, True), box_in(np.nan_to_num(volume), True))

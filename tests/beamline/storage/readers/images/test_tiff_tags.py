@@ -103,6 +103,8 @@ def test_a_file_of_an_ome_set_has_its_own_pages_alone(tmp_path: Path, stack: NDA
             np.testing.assert_array_equal(source.read(slice(None)), stack[pages * i : pages * (i + 1)])
             (field,) = source.not_used
             assert (field.where, field.value) == ("images of an OME set in other files", str(N - pages))
+        with pytest.raises(DataError, match=rf"others hold {N - pages} images: give them with --append FILE"):
+            open_scan(SourceOptions(tmp_path / name, angles=np.arange(N + 1.0)))
     if pages == 1:
         with open_scan(tmp_path) as source:
             np.testing.assert_array_equal(source.read(slice(None)), stack)
