@@ -175,8 +175,8 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
     """The frames of all files, of the kinds that the caller says."""
     kinds, _ = kinds_and_views(options.frames)
     own_angles, given = options.angles is None and options.angles_path is None, (options.darks, options.flats)
-    own_kinds = kinds is not None and not only_left_out(kinds)
-    opening = Opening(follow, own_angles, own_kinds, options.quantity == "counts" and given == (None, None))
+    kinds = None if only_left_out(kinds) else kinds
+    opening = Opening(follow, own_angles, kinds is not None, options.quantity == "counts" and given == (None, None))
     with ExitStack() as opened:
 
         def file(path: Path) -> ScanSource:
@@ -203,8 +203,11 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     if side is not None:
         base = with_side_file(base, side)
     n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
-    _, views = kinds_and_views(options.frames)
+    kinds, views = kinds_and_views(options.frames)
     angles, angles_from = _angle_table(options, base, side)
+    kept = with_kinds(base, kinds) if kinds is not None and only_left_out(kinds) else None
+    listed = kept is None or angles is None or angles.size != kept.table.views.size  # also those that are left out
+    base = base if listed or kept is None else kept
     base = with_order(
         base, options.order if options.data_path is None else None, None if angles is None else angles.size
     )
@@ -214,6 +217,8 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
             angles = np.repeat(angles, of_each)
         assigned = assign(base, angles, angles_from, of_views=options.angle_rows is not None)
         base = Frames(base, table=lambda known: replace(known, angles=assigned))
+    if kinds is not None and kept is not None and listed:
+        base = with_kinds(base, kinds)
     if views is not None:
         base = selected(base, views)
     if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base)) is not None:
