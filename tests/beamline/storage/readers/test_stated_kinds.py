@@ -130,7 +130,7 @@ def test_frames_that_are_left_out_alone_keep_the_kinds_of_the_others(tmp_path: P
         assert source.table.kinds.tolist() == [DARK, FLAT, VIEW, NONE, NONE, VIEW, VIEW, NONE]
     angles = np.array([0, np.nan, 20, 30, np.nan, 50])
     (finding,) = [each.message for each in validate(SourceOptions(path, angles=angles)) if "No angle" in each.message]
-    assert "--frames none=3:4+6:7." in finding
+    assert "--frames none=3:4+6:7." in finding  # as it is given below
     for given in (angles, angles[np.isfinite(angles)]):  # of all views, or of those that are left
         with open_scan(SourceOptions(path, angles=given, frames="none=3:4+6:7")) as source:
             np.testing.assert_array_equal(source.table.angles[source.table.views], [0, 20, 30, 50])
