@@ -241,7 +241,7 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
         datasets.refuse_broken(file, "exchange/theta")
         start, step = (_of_rotation(file, what) for what in ("start", "step"))
         if start is not None and step:
-            return start + step * np.arange(n_views)
+            return start + step * np.arange(n_views, dtype=np.float64)
         raise DataError(
             f"{file.filename} has no /exchange/theta, and nothing under /process or among its attributes states one "
             "start and one step of a rotation. Some readers then assume 0 to 180 degrees; we do not: "
@@ -260,21 +260,18 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
 def _of_rotation(file: h5py.File, what: str) -> float | None:
     """The one number, in radians, that attributes or the acquisition under /process call so of a rotation, in degrees
     unless they state a unit; None: several or none."""
-    found = set[float]()
-
-    def look(name: str, item: Any) -> None:
-        stated = {f"{name}/{key}": value for key, value in item.attrs.items()}
-        if isinstance(item, h5py.Dataset) and item.size == 1:
-            stated[name] = item[()]
-        factor = datasets.factor_of(datasets.attribute(item, "units") or "degrees", datasets.ANGLE_UNITS)
-        for where, value in stated.items():
-            if what in where.lower() and _ROTATION.search(where.lower()) and np.asarray(value).dtype.kind in "iuf":
-                found.add(float(np.ravel(value)[0]) * (factor or np.nan))
-
-    for name in ("/", "exchange", "exchange/data"):
-        look("", file[name])
+    items: list[Any] = [file, file["exchange"], file["exchange/data"]]
     if isinstance(process := datasets.resolve(file, "process"), h5py.Group):
-        process.visititems(look)
+        process.visititems(lambda _, item: items.append(item))
+    stated = [(f"{item.name}/{key}", value, item) for item in items for key, value in item.attrs.items()]
+    stated += [(item.name, item[()], item) for item in items if isinstance(item, h5py.Dataset) and item.size == 1]
+    ours = [each for each in stated if what in each[0].lower() and _ROTATION.search(each[0].lower())]
+    units = [datasets.attribute(item, "units") or "degrees" for *_, item in ours]
+    found = {
+        float(np.ravel(value)[0]) * (datasets.factor_of(unit, datasets.ANGLE_UNITS) or np.nan)
+        for (_, value, _), unit in zip(ours, units, strict=True)
+        if np.asarray(value).dtype.kind in "iuf" and np.size(value) == 1
+    }
     return found.pop() if len(found) == 1 else None
 
 

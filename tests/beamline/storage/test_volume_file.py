@@ -123,8 +123,8 @@ def test_what_is_no_volume_file_is_refused(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("suffix", ["png", "bmp", "PNG", "jpg", "tif"])
 def test_slices_of_other_programs_are_a_volume_without_the_preview_beside_them(tmp_path: Path, suffix: str) -> None:
     slices = np.repeat(np.arange(11, dtype=np.uint8) * 20, 8 * 10).reshape(11, 8, 10)
-    for z, values in enumerate(slices):
-        Image.fromarray(values).save(tmp_path / f"rec_{z}.{suffix}")
+    for z, one in enumerate(slices):
+        Image.fromarray(one).save(tmp_path / f"rec_{z}.{suffix}")
     Image.fromarray(slices[0, :3]).save(tmp_path / f"rec_spr.{suffix}")
     for name, content in (
         ("rec_.log", "[Reconstruction]\nPixel Size (um)=7.95\n"),

@@ -170,7 +170,7 @@ def _half_a_turn_on(series: list[str]) -> list[str]:
     return named if 2 * len(named) < len(series) and len(named) == sum(map(bool, stated.values())) else []
 
 
-def _places(path: object, stated: NamedAngles, images: list[str], *, one_series: bool) -> NDArray[np.int64]:
+def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_series: bool) -> NDArray[np.int64]:
     """The number of each image of a series, by its name without an angle. DataError: there are several series.
 
     Series of which each counts anew follow one another, as where their names say of which kind they are.
@@ -256,7 +256,7 @@ def places_of(names: Sequence[str]) -> str:
 _LISTED = 6  # series that a sentence names
 
 
-def _several_series(path: object, names: Sequence[str], images: list[str]) -> str:
+def _several_series(path: object, names: Sequence[str], images: Sequence[str]) -> str:
     templates = [_template(name) for name in names]
     if len(set(templates)) == 1:
         templates = [re.sub(r"\d+(?=\D*$)", "", name) for name in names]
