@@ -163,9 +163,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         side = side_of(base) if options.side_file is None else None
         if side is None:
             raise
-        raise DataError(
-            f"{error} Beside it lies {side.path.name}: --scanner-file {side.path} takes it ({side})."
-        ) from error
+        raise DataError(f"{error} Beside it lies {side.path.name}: {side.option} takes it ({side}).") from error
     except BaseException:
         base.close()
         raise

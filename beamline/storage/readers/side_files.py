@@ -114,6 +114,11 @@ class SideFile:
     angles: NDArray[np.float64] | None
     white: float | None
 
+    @property
+    def option(self) -> str:
+        """The option that takes the file, for a command line."""
+        return f'--scanner-file "{self.path}"' if " " in str(self.path) else f"--scanner-file {self.path}"
+
     def __str__(self) -> str:
         sod, sdd = self.cone
         angles = "" if self.angles is None else f", angles from {np.degrees(self.angles[0]):.6g} to "
@@ -183,7 +188,7 @@ def reconstructed_pixel_mm(log: Path) -> float | None:
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
     """A sentence on what a vendor's file beside these images states."""
     side = side_of(source)
-    return () if side is None else (NotUsed(side.path.name, str(side), f"--scanner-file {side.path} takes it", True),)
+    return () if side is None else (NotUsed(side.path.name, str(side), f"{side.option} takes it", True),)
 
 
 def _candidates(scan: Path) -> Iterator[Path]:

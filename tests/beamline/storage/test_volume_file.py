@@ -133,7 +133,7 @@ def test_slices_of_other_programs_are_a_volume_without_the_preview_beside_them(t
     ):
         (tmp_path / name).write_text(content)
     values, spacing = read_volume(tmp_path)
-    np.testing.assert_allclose(values, slices, atol=2 * (suffix == "jpg"))
+    np.testing.assert_allclose(np.asarray(values, np.float64), slices, atol=2 * (suffix == "jpg"))
     assert spacing == pytest.approx((0.00795,) * 3)
     (tmp_path / "rec_.log").write_text("[2026-05-03] begun\n  taken\n")
     assert read_volume(tmp_path)[1] is None

@@ -159,7 +159,8 @@ def test_distances_pixels_and_angles_are_taken(images: Path, name: str, encoding
         assert (source.cone, source.pixel_size_mm) == (None, None)
         assert np.isnan(source.table.angles).all()
         assert [field.where for field in source.not_used] == [name]
-    assert [f.message for f in validate(images) if f"--scanner-file {side}" in f.message]
+    named = f'"{side}"' if " " in name else side
+    assert [f.message for f in validate(images) if f"--scanner-file {named}" in f.message]
     with open_scan(SourceOptions(images, side_file=side, quantity="counts")) as source:
         assert source.cone == pytest.approx((60, 300))
         assert source.pixel_size_mm == pytest.approx(0.2)
