@@ -97,7 +97,7 @@ class Declared(click.Option):
         inverted: it is a flag that switches the setting off.
         excludes: long names of options that do not go with it, and why.
         needs: another option, without which this one means nothing, and the end of the sentence that says so.
-        of_one_call: it is of one scan or call, and never part of a recipe.
+        of_one_call: it is of one scan or call, and not written into a recipe.
         former: its long name in the last version, which is still understood, and shown nowhere.
     """
 

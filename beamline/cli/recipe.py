@@ -102,13 +102,17 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
     )(command)
 
 
+_OF_ALL = ("angles", "angle-rows", "darks", "flats", "scanner-file")
+"""Options on the data of one scan that a user may write into a recipe, where they hold for all scans."""
+
+
 def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> None:
     if value is None:
         return
     options = {
         name_of(option): option
         for option in ctx.command.params
-        if isinstance(option, click.Option) and not _is_of_one_call(option)
+        if isinstance(option, click.Option) and (not _is_of_one_call(option) or name_of(option) in _OF_ALL)
     }
     former = {
         option.former.lstrip("-"): option

@@ -84,6 +84,7 @@ scan_options = together(
         "--frames",
         metavar="KINDS",
         help="Kinds of frames, overriding names and keys of the file: darks=0:5,flats=5:10+95:100. Others are views. "
+        "none=30:38+61:62 leaves frames out; alone, it keeps the kinds of the others. "
         "0::2 or 1::2: every second view, with its darks and flats, where two exposures or thresholds alternate.",
     ),
     option(

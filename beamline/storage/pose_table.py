@@ -127,6 +127,12 @@ def _of_csv(path: Path, content: str) -> PoseTable:
     head, *rows = list(csv.reader(lines)) or [[]]
     names = [name.strip().lower() for name in head]
     cone = next((cone for cone, columns in _VECTORS.items() if columns[0] in names), None)
+    if lines and len(re.split(r"[\s,]+", lines[0].strip())) == 12 and not re.search("[a-df-z]", lines[0]):
+        raise ValueError(
+            f"{path} has 12 numbers a line and no names, as vectors of ASTRA. Save them with the name of their kind, "
+            f"cone_vec or parallel3d_vec: python -c \"import numpy as np; np.savez('poses.npz', cone_vec=np.loadtxt("
+            f"'{path.name}'))\", and give --poses poses.npz"
+        )
     _require_header(path, names, cone)
     columns = dict(zip(names, _numbers(path, names, rows).T, strict=True))
     by = next(name for name in _KEYS if name in columns)

@@ -1,4 +1,4 @@
-"""Volume file: a volume [z, y, x] read from TIFF (a file, or a folder of slices), NumPy, NIfTI, HDF5 or Zarr."""
+"""Volume file: a volume [z, y, x] read from TIFF, a folder of slices, NumPy, NIfTI, HDF5 or Zarr."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 from tifffile import natural_sorted
 
 from beamline.core.errors import DataError
@@ -19,6 +20,7 @@ from beamline.core.files import RECON, no_file, refuse_substitute, require_regul
 from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import is_zarr, numpy_arrays, require_room
 from beamline.storage.foreign_zarr import open_zarr
+from beamline.storage.readers.side_files import reconstructed_pixel_mm
 from beamline.storage.readers.tiff import require_possible
 
 LENGTHS = MappingProxyType({0: 1.0, 1: 1e3, 2: 1.0, 3: 1e-3})
@@ -46,7 +48,7 @@ def read_volume(
         require_room(path, math.prod(scale.shape) * scale.dtype.itemsize)
         return scale[:], spacing
     if path.is_dir():
-        return _from_folder(path), None
+        return _from_folder(path)
     if not path.is_file():
         raise DataError(no_file(path))
     if dataset is not None and name.endswith((".tif", ".tiff", ".npy", ".nii", ".nii.gz")):
@@ -123,25 +125,42 @@ def _tiff_spacing(tif: tifffile.TiffFile) -> tuple[float, float, float] | None:
     return (z, y, x) if all(0 < each < math.inf for each in mm) else None
 
 
-def _from_folder(path: Path) -> NDArray[np.generic]:
-    """The TIFF slices of a folder, in the order of the numbers in their names."""
-    files = [
-        item for item in path.iterdir() if item.suffix.lower() in (".tif", ".tiff") and not item.name.startswith(".")
-    ]
+_PICTURES = (".png", ".bmp", ".jpg", ".jpeg")
+
+
+def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float] | None]:
+    """The slices of a folder, in the order of the numbers in their names, and the edges of a voxel in mm, if the log of
+    NRecon beside them states one.
+
+    Slices are the TIFFs, or else the grey pictures, whose names differ in numbers alone; a single one of another name,
+    such as a preview, is none.
+    """
+    names = natural_sorted(item.name for item in path.iterdir() if not item.name.startswith("."))
+    by_kind = ([name for name in names if name.lower().endswith(kind)] for kind in ((".tif", ".tiff"), _PICTURES))
+    series: dict[str, list[str]] = {}
+    for name in next(filter(None, by_kind), []):
+        series.setdefault(re.sub(r"\d+", "#", name), []).append(name)
+    files = max(series.values(), key=len, default=[])
+    files = files if len(files) > 1 else [name for some in series.values() for name in some]
     if not files:
         inside = [path / name for name in (RECON, "volume.h5") if (path / name).is_file()]
         raise DataError(
-            f"{path} is a folder without TIFF slices"
+            f"{path} is a folder without slices as TIFF or grey pictures"
             + (
                 f"; its volume is {inside[0]}."
                 if inside
                 else f"; a volume is such a folder, a Zarr, or {', '.join(SUFFIXES)}."
             )
         )
+    if others := [f"{len(some)} of {name}" for name, some in series.items() if len(some) > 1 and some is not files]:
+        raise DataError(
+            f"{path} holds several series of images: {len(files)} such as {files[0]}, {', '.join(others)}. Give each "
+            "volume a folder of its own."
+        )
     slices: NDArray[np.generic] | None = None
-    for z, name in enumerate(natural_sorted(item.name for item in files)):
+    for z, name in enumerate(files):
         try:
-            values, _ = _from_tiff(path / name)
+            values = _of_picture(path / name) if name.lower().endswith(_PICTURES) else _from_tiff(path / name)[0]
         except Exception as error:  # as of other foreign files
             raise DataError(f"{path / name} cannot be read ({type(error).__name__}: {error}).") from error
         if slices is None:
@@ -154,7 +173,19 @@ def _from_folder(path: Path) -> NDArray[np.generic]:
             )
         slices[z] = values
     assert slices is not None
-    return slices
+    edges = {edge for log in path.glob("*.log") if (edge := reconstructed_pixel_mm(log)) is not None}
+    return slices, (edges.pop(),) * 3 if len(edges) == 1 else None
+
+
+def _of_picture(path: Path) -> NDArray[np.generic]:
+    """A picture [y, x] whose colours, if it has any, are greys."""
+    with Image.open(path) as picture:
+        if picture.mode.startswith(("L", "I", "F")) and picture.mode != "LA":
+            return np.asarray(picture)
+        colours = np.asarray(picture.convert("RGB"))
+    if np.ptp(colours, axis=2).any():
+        raise ValueError("it has colours; expected greys")
+    return np.ascontiguousarray(colours[..., 0])
 
 
 def _from_nifti(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, float]]:

@@ -57,7 +57,10 @@ def parse_views(spec: str, angles: ArrayLike, seed: int = 0, *, period: float = 
         return np.sort(rng.choice(views, n, replace=False))
     if name == "sector" and (match := _SECTOR.fullmatch(rest)):
         return _sector(theta, float(match[1]), float(match[2]), match[3], spec, period)
-    raise ValueError(f"unknown selection of views {spec!r}; use one of: {FORMS}")
+    raise ValueError(
+        f"unknown selection of views {spec!r}; use one of: {FORMS}; of a scan file, --frames none=30:38+61:62 leaves "
+        "these frames out"
+    )
 
 
 def _enough(n: int, available: int, spec: str) -> int:

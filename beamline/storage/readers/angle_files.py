@@ -18,6 +18,7 @@ from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays, open_array_file
 from beamline.storage.readers.base import ScanSource
 from beamline.storage.readers.stacks import arrays_of, dataset_at, datasets_text, in_frame_of_detector
+from beamline.storage.readers.tiff import OTHER_FILES
 
 Angles = Path | str | ArrayLike
 """A file, or FILE::NAME of a column or a dataset, in degrees unless it states a unit; or an array in radians."""
@@ -205,6 +206,11 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
         )
     else:
         message = f"{name} has {angles.size} angles, but there are {n} projections among {frames} frames"
+    if others := [field.value for field in source.not_used if field.where == OTHER_FILES]:
+        message += (
+            f". By its OME metadata {source.path} is one file of a set, the others hold {others[0]} images: give them "
+            "with --append FILE"
+        )
     if series is not None and (gaps := source.attributes.get("missing_numbers")):
         message += (
             f". The numbers of the files go from {series.min()} to {series.max()} and leave out {gaps}: of "
@@ -217,11 +223,19 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
             f"{angles.size}, the first {lost} or the last {lost} may be lost"
         )
     if angles.size < n:
-        return f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order."
+        return (
+            f"{message}. Is it cut off, or of another scan? Give one angle for each projection, in their order. Images "
+            "among them that are darks or flats are given with --darks and --flats, or named by --frames."
+        )
     sinograms, window = "", evenly_spaced_window(angles, n)
     if angles.size in source.shape:
         order = ("row,view,col", "row,col,view")[source.shape.index(angles.size)]
         sinograms = f"If each image is a sinogram of {angles.size} views, say --order {order}; if not, say"
+        if not source.table.are_views.all():
+            sinograms = (
+                f"If an image is a sinogram of {angles.size} views, give it alone as FILE, and the others with --darks "
+                "and --flats; if not, say"
+            )
     message += (
         f". {sinograms or 'Say'} with --angle-rows A:B which {n} belong to the projections (from 0, B not included)"
     )

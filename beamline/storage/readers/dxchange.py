@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -237,8 +239,12 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
     theta = datasets.dataset(file, "exchange/theta")
     if theta is None:
         datasets.refuse_broken(file, "exchange/theta")
+        start, step = (_of_rotation(file, what) for what in ("start", "step"))
+        if start is not None and step:
+            return start + step * np.arange(n_views, dtype=np.float64)
         raise DataError(
-            f"{file.filename} has no /exchange/theta. Some readers then assume 0 to 180 degrees; we do not: "
+            f"{file.filename} has no /exchange/theta, and nothing under /process or among its attributes states one "
+            "start and one step of a rotation. Some readers then assume 0 to 180 degrees; we do not: "
             "give them with --angles FILE (degrees, one a line)."
         )
     angles = datasets.radians(theta, default="degrees")
@@ -249,6 +255,27 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
             f"{theta.shape}; expected one angle for each.{way if angles.size > n_views else ''}"
         )
     return angles
+
+
+def _of_rotation(file: h5py.File, what: str) -> float | None:
+    """The one number, in radians, that attributes or the acquisition under /process call so of a rotation, in degrees
+    unless they state a unit; None: several or none."""
+    items: list[Any] = [file, file["exchange"], file["exchange/data"]]
+    if isinstance(process := datasets.resolve(file, "process"), h5py.Group):
+        process.visititems(lambda _, item: items.append(item))
+    stated = [(f"{item.name}/{key}", value, item) for item in items for key, value in item.attrs.items()]
+    stated += [(item.name, item[()], item) for item in items if isinstance(item, h5py.Dataset) and item.size == 1]
+    ours = [each for each in stated if what in each[0].lower() and _ROTATION.search(each[0].lower())]
+    units = [datasets.attribute(item, "units") or "degrees" for *_, item in ours]
+    found = {
+        float(np.ravel(value)[0]) * (datasets.factor_of(unit, datasets.ANGLE_UNITS) or np.nan)
+        for (_, value, _), unit in zip(ours, units, strict=True)
+        if np.asarray(value).dtype.kind in "iuf" and np.size(value) == 1
+    }
+    return found.pop() if len(found) == 1 else None
+
+
+_ROTATION = re.compile("rot|angle|angular|theta|omega")
 
 
 def _attributes(file: h5py.File) -> dict[str, str | float | int]:

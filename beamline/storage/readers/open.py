@@ -27,7 +27,7 @@ from beamline.storage.readers.nexus import find
 from beamline.storage.readers.no_data import marked_source, no_data_of
 from beamline.storage.readers.nxtomo import open_nxtomo
 from beamline.storage.readers.orders import with_order
-from beamline.storage.readers.reference_files import Images, load_images, overlaid, stated_references
+from beamline.storage.readers.reference_files import Images, load_images, overlaid, places_of_flats, stated_references
 from beamline.storage.readers.side_files import SideFile, read_side_file, side_of, with_side_file
 from beamline.storage.readers.stacks import datasets_text, open_stacks
 from beamline.storage.readers.tiff import FOREIGN, no_image
@@ -37,6 +37,7 @@ from beamline.storage.readers.transforms import (
     cropped,
     in_parts,
     kinds_and_views,
+    only_left_out,
     real_type,
     selected,
     turned,
@@ -162,9 +163,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         side = side_of(base) if options.side_file is None else None
         if side is None:
             raise
-        raise DataError(
-            f"{error} Beside it lies {side.path.name}: --scanner-file {side.path} takes it ({side})."
-        ) from error
+        raise DataError(f"{error} Beside it lies {side.path.name}: {side.option} takes it ({side}).") from error
     except BaseException:
         base.close()
         raise
@@ -174,6 +173,7 @@ def _base(path: Path, options: SourceOptions, follow: bool) -> ScanSource:
     """The frames of all files, of the kinds that the caller says."""
     kinds, _ = kinds_and_views(options.frames)
     own_angles, given = options.angles is None and options.angles_path is None, (options.darks, options.flats)
+    kinds = None if only_left_out(kinds) else kinds
     opening = Opening(follow, own_angles, kinds is not None, options.quantity == "counts" and given == (None, None))
     with ExitStack() as opened:
 
@@ -201,8 +201,11 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     if side is not None:
         base = with_side_file(base, side)
     n = stated_frames_per_view(base) if options.frames_per_view is None else options.frames_per_view
-    _, views = kinds_and_views(options.frames)
+    kinds, views = kinds_and_views(options.frames)
     angles, angles_from = _angle_table(options, base, side)
+    kept = with_kinds(base, kinds) if kinds is not None and only_left_out(kinds) else None
+    listed = kept is None or angles is None or angles.size != kept.table.views.size  # also those that are left out
+    base = base if listed or kept is None else kept
     base = with_order(
         base, options.order if options.data_path is None else None, None if angles is None else angles.size
     )
@@ -212,6 +215,8 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
             angles = np.repeat(angles, of_each)
         assigned = assign(base, angles, angles_from, of_views=options.angle_rows is not None)
         base = Frames(base, table=lambda known: replace(known, angles=assigned))
+    if kinds is not None and kept is not None and listed:
+        base = with_kinds(base, kinds)
     if views is not None:
         base = selected(base, views)
     if (base.untyped or base.dtype.str[1:] in _SIGNED) and (dtype := _true_type(base)) is not None:
@@ -244,6 +249,7 @@ def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | 
         darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
         flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
         quantity="counts" if quantity == "transmission" else quantity,
+        places=places_of_flats(flats, base.shape),
     )
 
 

@@ -18,7 +18,7 @@ from beamline.storage import datasets, hdf5
 from beamline.storage.array_file import holds_arrays, open_array_file
 from beamline.storage.datasets import require_real
 from beamline.storage.frame_table import FrameTable
-from beamline.storage.readers.base import Quantity, ScanSource, Stated
+from beamline.storage.readers.base import Quantity, ScanSource, Stated, frame_indices
 from beamline.storage.readers.dxchange import open_exchange
 from beamline.storage.readers.frames import Frames
 from beamline.storage.readers.nexus import find
@@ -68,7 +68,8 @@ def stated_references(
     if base.dtype.kind != "f":
         raise DataError(
             f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
-            "stands for 1, give it as --flats 65535 or the like, with --darks 0, and leave out --quantity."
+            "stands for 1, such as 65535, or the counts of air beside the sample, give it: --flats 65535 --darks 0, "
+            "without --quantity."
         )
     return nothing, np.ones_like(nothing)
 
@@ -150,6 +151,8 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
         return _of_scan(open_exchange(path, own_angles=False), kind)
     if exchange is not None:
         return _read(path, exchange)
+    if numbered := _numbered(file, kind, shape):
+        return np.concatenate([_read(path, item) for _, item in sorted(numbered.items())])
     candidates = [item for item in _images(file) if shape is None or item.shape[-2:] == shape]
     if len(candidates) == 1:
         return _read(path, candidates[0])
@@ -166,6 +169,24 @@ def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
     """Frames of a kind as the reader of their format gives them, mirrored and turned as the file says."""
     with source:
         return _stack(source.read(source.table.of_kind(kind)), str(source.path))
+
+
+def _numbered(file: h5py.File, kind: FrameKind, shape: tuple[int, int] | None) -> dict[int, h5py.Dataset]:
+    """The images of a kind by the frames before which they were taken, as BLISS and nabu keep them: /entry/flats/0 and
+    /entry/flats/89."""
+    named = [(str(item.name).rpartition("/"), item) for item in _images(file) if shape in (None, item.shape[-2:])]
+    ours = [(of, number, item) for (of, _, number), item in named if number.isdecimal() and kind.name.lower() in of]
+    return {int(number): item for _, number, item in ours} if len({of for of, *_ in ours}) == 1 else {}
+
+
+def places_of_flats(images: Images | None, shape: tuple[int, int]) -> NDArray[np.float64] | None:
+    """Where in a scan, from its first frame (0) to its last (1), each of the flats in a file was taken; None: it does
+    not say."""
+    if not isinstance(images, Path | str) or not Path(images).is_file() or not hdf5.is_hdf5(Path(images)):
+        return None
+    with hdf5.open_hdf5(Path(images)) as file, hdf5.readable(Path(images)):
+        numbers = np.array(sorted(_numbered(file, FrameKind.FLAT, shape)), np.float64)
+    return (numbers - numbers[0]) / np.ptp(numbers) if numbers.size > 1 else None
 
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
@@ -201,6 +222,7 @@ def overlaid(
     darks: NDArray[Any] | None = None,
     flats: NDArray[Any] | None = None,
     quantity: Quantity | None = None,
+    places: NDArray[np.float64] | None = None,
 ) -> ScanSource:
     """A scan with references in front: darks, flats, then the frames of `base`.
 
@@ -209,6 +231,7 @@ def overlaid(
 
     Args:
         darks, flats: [frame, row, col].
+        places: of the flats in the scan, from its first frame (0) to its last (1); None: before it.
 
     Raises:
         DataError: shapes or counts do not fit.
@@ -236,4 +259,14 @@ def overlaid(
         starts = np.where((table.part_starts > len(front.table)) & (flats is None), table.part_starts, 0)
         return replace(table, part_starts=np.unique(starts))
 
-    return Frames(front, base, in_order=base.in_order, checksummed=base.checksummed, table=of_all_parts)
+    whole = Frames(front, base, in_order=base.in_order, checksummed=base.checksummed, table=of_all_parts)
+    if places is None or places.size != len(given[FrameKind.FLAT]):
+        return whole
+    place = np.r_[np.full(len(front.table), -1.0), np.arange(len(base.table))]
+    place[len(front.table) - places.size : len(front.table)] = places * len(base.table) - 0.5
+    order = np.argsort(place, kind="stable")
+    return Frames(
+        whole,
+        pixels=lambda read, frames, rows: read(order[frame_indices(frames, order.size)], rows),
+        table=lambda known: replace(known.take(order), part_starts=np.zeros(1, np.int64)),
+    )

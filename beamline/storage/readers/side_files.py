@@ -1,6 +1,7 @@
 """Files that makers of CT scanners write beside their images: distances, pixel size, angles and white level.
 
-Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON and the .xml of Diondo, by keys that
+Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON, the .xml of Diondo and
+the "data settings XRE.txt" of TESCAN (FleXray), by keys that
 public readers use (TIGRE, CIL). A key that is not there is not guessed.
 """
 
@@ -37,7 +38,7 @@ class MakerKeys:
         pixel: width of a pixel in mm, times `unit`; at the sample where `at_sample`.
         count: of the projections.
         step, span: degrees from one to the next, or of all.
-        first: degrees of the first one.
+        first, last: degrees of the first one, and of the last.
         white: counts of the open beam.
         scale: a factor of both distances.
         helix: keys that say "true" where the source goes round on another path than a circle.
@@ -54,11 +55,13 @@ class MakerKeys:
     step: str = ""
     span: str = ""
     first: str = ""
+    last: str = ""
     white: str = ""
     scale: str = ""
     helix: tuple[str, ...] = ()
 
 
+_XRE = "ct-parameters in/"
 _YXLON = "conebeamscanparameter/scantrajectory/"
 MAKERS = (
     MakerKeys(
@@ -83,6 +86,10 @@ MAKERS = (
         "Diondo", ".xml", "geometrie/sourceobjectdist", "geometrie/sourcedetectordist", "recon/projectionpixelsizex",
         "recon/projectioncount", helix=("scanparameter/helixmode", "scanparameter/laminography"),
     ),
+    MakerKeys(
+        "TESCAN", ".txt", f"{_XRE}sod", f"{_XRE}sdd", f"{_XRE}pixel size", f"{_XRE}projections",
+        first=f"{_XRE}start angle", last=f"{_XRE}last angle",
+    ),
 )  # fmt: skip
 _ROUND = {"Diondo": 360.0}  # degrees of the scans of a maker whose file states none
 
@@ -106,6 +113,11 @@ class SideFile:
     count: int
     angles: NDArray[np.float64] | None
     white: float | None
+
+    @property
+    def option(self) -> str:
+        """The option that takes the file, for a command line."""
+        return f'--scanner-file "{self.path}"' if " " in str(self.path) else f"--scanner-file {self.path}"
 
     def __str__(self) -> str:
         sod, sdd = self.cone
@@ -159,23 +171,31 @@ def side_of(source: ScanSource) -> SideFile | None:
         return None
     views, found = source.table.views.size, []
     for path in _candidates(source.path):
-        with suppress(DataError):
+        with suppress(Exception):  # what is only looked at, for an offer, stops no scan, whatever it holds
             found.append(read_side_file(path))
     found = [side for side in found if side.count == views]
     return found[0] if len(found) == 1 else None
 
 
+def reconstructed_pixel_mm(log: Path) -> float | None:
+    """Edge of a voxel in mm by the log that NRecon writes beside its slices; None where it states none."""
+    with suppress(Exception):  # whatever the log of another program holds
+        edge = float(with_points([_values(log)["reconstruction/pixel size (um)"]])[0]) * 1e-3
+        return edge if 0 < edge < _LARGEST else None
+    return None
+
+
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
     """A sentence on what a vendor's file beside these images states."""
     side = side_of(source)
-    return () if side is None else (NotUsed(side.path.name, str(side), f"--scanner-file {side.path} takes it", True),)
+    return () if side is None else (NotUsed(side.path.name, str(side), f"{side.option} takes it", True),)
 
 
 def _candidates(scan: Path) -> Iterator[Path]:
     suffixes, n = {keys.suffix for keys in MAKERS}, 0
     for folder in (scan, scan.parent) if scan.is_dir() else (scan.parent,):
         for path in sorted(folder.glob("*.*")):
-            if path.suffix.lower() in suffixes and n < _MOST and path.is_file():
+            if path.suffix.lower() in suffixes and n < _MOST:
                 n += 1
                 yield path
 
@@ -191,9 +211,12 @@ def _values(path: Path) -> dict[str, str]:
         _of_json(json.loads(text), "", values)
     else:
         parser = configparser.RawConfigParser(strict=False, allow_no_value=True, delimiters=("=",))
-        parser.read_string(text.lstrip("\ufeff"))
+        lines = "\n".join(map(str.strip, text.splitlines()))  # indented ones continue none
+        parser.read_string(lines.replace("\n# projections", "\nprojections"))  # a key of TESCAN's, no comment
         values = {
-            f"{section}/{key}".lower(): value or "" for section in parser for key, value in parser[section].items()
+            f"{section}/{key}".lower(): (value or "").strip('"')
+            for section in parser
+            for key, value in parser[section].items()
         }
     return values
 
@@ -221,7 +244,7 @@ def _of_json(item: Any, path: str, values: dict[str, str]) -> None:
 
 def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str, float | None]:
     """The number at the beginning of the text of each key, by the names in MakerKeys; None for a text without one."""
-    names = ("sod", "sdd", "pixel", "count", "step", "span", "first", "white", "scale")
+    names = ("sod", "sdd", "pixel", "count", "step", "span", "first", "last", "white", "scale")
     texts = [values.get(getattr(keys, name), "") for name in names]
     try:
         numbers = (re.match(rf"\s*[-+]?{NUMBER}", text) for text in with_points(texts))
@@ -230,13 +253,17 @@ def _numbers(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> dict[str
     return {name: number and float(number[0]) for name, number in zip(names, numbers, strict=True)}
 
 
+_NEEDED = "sod", "sdd", "pixel", "count"
+_LARGEST = 1e7  # of these numbers: no scan has as many projections, and no distance is as long in mm
+
+
 def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
     number = _numbers(path, keys, values)
     if other := next((key for key in keys.helix if values.get(key, "").lower() == "true"), ""):
         raise DataError(f"{path} says {other}: only scans on a circle are supported.")
-    sod, sdd, pixel, count = (number[name] or 0.0 for name in ("sod", "sdd", "pixel", "count"))
-    if lacking := [getattr(keys, name) for name in ("sod", "sdd", "pixel", "count") if not (number[name] or 0) > 0]:
-        raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers.")
+    sod, sdd, pixel, count = (number[name] or 0.0 for name in _NEEDED)
+    if lacking := [getattr(keys, name) for name in _NEEDED if not 0 < (number[name] or 0) < _LARGEST]:
+        raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers below {_LARGEST:g}.")
     pixel *= keys.unit * (sdd / sod if keys.at_sample else 1.0)
     n, scale = int(count), number["scale"] or 1.0
     angles = _degrees(path, keys, number, n)
@@ -249,6 +276,8 @@ def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n:
     if keys.maker == "Nikon" and (listed := _listed_angles(path, n)) is not None:
         return listed
     step, span = number["step"], number["span"] or _ROUND.get(keys.maker)
+    if number["last"] is not None and n > 1:
+        step = (number["last"] - (number["first"] or 0.0)) / (n - 1)
     if step is None and span is not None:
         step = span / n
     return None if step is None else (number["first"] or 0.0) + step * np.arange(n, dtype=np.float64)

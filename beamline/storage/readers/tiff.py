@@ -29,6 +29,7 @@ VOLUME = "splatline volume"  # Value of `format` in the facts of a file that is 
 UNREADABLE = (*ALTERED, ImportError, lzma.LZMAError, tifffile.TiffFileError, Image.DecompressionBombError)
 """What tifffile, zipfile, Pillow and their decoders raise for a file that they cannot read; none of ours is among
 them."""
+OTHER_FILES = "images of an OME set in other files"
 _NO_IMAGE = 1 | 4  # bits of NewSubfileType: an image of reduced resolution, a mask
 logging.getLogger("tifffile").addHandler(logging.NullHandler())  # else what it logs goes to stderr, beside our sentence
 
@@ -109,7 +110,7 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
     copies = sum(len(part.levels) for part in tif.series) - len(images_of(tif))
     notes = [("pages of other resolutions or masks", copies, False)] if copies else []
     if path.suffix.lower() in SUFFIXES and listed > len(tif.pages):
-        notes += [("images of an OME set in other files", listed - len(tif.pages), True)]
+        notes += [(OTHER_FILES, listed - len(tif.pages), True)]
     return tuple(NotUsed(where, str(n), why, doubt) for where, n, doubt in notes)
 
 

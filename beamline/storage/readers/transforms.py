@@ -103,15 +103,15 @@ def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
 
     Args:
         kinds: such as "darks=0:5,flats=5:10+95:100,views=10:95", rows of the scan, ends not included. Without views
-            all other frames are projections, else invalid. "energy=20" makes frames of other energies invalid, by the
-            file.
+            all other frames are projections, else invalid. "none=30:38" alone makes these invalid, and others stay.
+            "energy=20" makes frames of other energies invalid, by the file.
 
     Raises:
         DataError: they are no such text, lie outside the scan, or the file states no such energy.
     """
     words, own = [word.strip() for word in kinds.split(",")], dict[str, Any]()
     named = [word for word in words if not word.startswith(_ENERGY)]
-    keys = _stated_keys(",".join(named), len(base.table)) if named else base.table.kinds.copy()
+    keys = _stated_keys(",".join(named), base.table.kinds) if named else base.table.kinds.copy()
     for word in words:
         if word.startswith(_ENERGY):
             own["energy_kev"], others = _of_one_energy(base, word)
@@ -151,15 +151,20 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
     return Frames(base, table=lambda known: known.without(np.concatenate(out)))
 
 
-def _stated_keys(kinds: str, n: int) -> NDArray[np.int32]:
-    """The kind of each of n frames by what the caller says."""
-    stated, named = np.full(n, -1), _ranges(kinds, n)
+def only_left_out(kinds: str | None) -> bool:
+    """Whether the caller says of no frame which kind it has, but of some that they are left out."""
+    return kinds is not None and all(word.strip().startswith(("none=", _ENERGY)) for word in kinds.split(","))
+
+
+def _stated_keys(kinds: str, known: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The kind of each frame by what the caller says, or by what is known where he says only which are left out."""
+    stated, named = np.full(known.size, -1), _ranges(kinds, known.size)
     for kind, first, end in named:
         if (stated[first:end] >= 0).any():
             raise DataError(f"--frames {kinds} names frame {first + int((stated[first:end] >= 0).argmax())} twice.")
         stated[first:end] = kind
     others = FrameKind.INVALID if any(kind is FrameKind.PROJECTION for kind, *_ in named) else FrameKind.PROJECTION
-    return np.where(stated < 0, others, stated).astype(np.int32)
+    return np.where(stated < 0, known if only_left_out(kinds) else others, stated).astype(np.int32)
 
 
 def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.bool_]]:
@@ -210,8 +215,8 @@ def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
             if name not in _KINDS or not first < end <= n:
                 raise DataError(
                     f"--frames {kinds}: {word.strip()!r} is none of {', '.join(_KINDS)} with frames of 0:{n}; expected "
-                    "such as darks=0:5,flats=5:10+95:100, frames counted from 0 in the order of the scan, or 0::2 for "
-                    "every second view."
+                    "such as darks=0:5,flats=5:10+95:100, none=30:38+61:62 for frames that are left out, counted from "
+                    "0 in the order of the scan (`beamline info` shows it), or 0::2 for every second view."
                 )
             ranges.append((_KINDS[name], first, end))
     return ranges

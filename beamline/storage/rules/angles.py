@@ -20,6 +20,7 @@ _EQUAL, _FEW = 1e-3, 4  # degrees between views of one direction; columns of the
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 _COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
+_LISTED = 20  # groups of frames in a sentence
 _MANY = 30  # views: fewer within 6.28 degrees may be a trial scan, and are not refused as radians
 
 
@@ -27,9 +28,12 @@ def angles_unknown(scan: ScanEvidence) -> str:
     """Which projections have no finite angle."""
     unknown = np.setdiff1d(views := scan.table.views, scan.table.views_with_angles)
     why = f"; {why}" if (why := scan.source.attributes.get("angles")) else ""
+    runs = np.split(unknown, np.flatnonzero(np.diff(unknown) > 1) + 1)
+    listed = "+".join(f"{run[0]}:{run[-1] + 1}" for run in runs[:_LISTED] if run.size) + "+..." * (len(runs) > _LISTED)
     return "" if not unknown.size else (
         f"No angle for {unknown.size} of {views.size} projections (first: frame {unknown[0]}){why}. Give them with "
-        "--angles FILE (degrees, one a line)."
+        "--angles FILE (degrees, one a line)"
+        f"{f', or leave these views out: --frames none={listed}' * (unknown.size < views.size)}."
     )  # fmt: skip
 
 

@@ -92,8 +92,9 @@ class Seen:
     help="Scan of the volume, from whose halves it is made again. Default: the one that the volume names.",
 )
 @click.option("--quick", is_flag=True, help="Leave out what the views do to the numbers.")
-@click.option("--crop", type=click.Choice(["square", "none"]), default="square", show_default=True,
-              help="square: inside the circle of the sample, or of the field, without a can's wall.")  # fmt: skip
+@click.option("--crop", type=click.Choice(["square", "finite", "none"]), default="square", show_default=True,
+              help="square: inside the circle of the sample, or of the field, without a can's wall. finite: inside the "
+                   "circle beyond which voxels are not finite.")  # fmt: skip
 @click.option("--memory", metavar="SIZE", callback=parsed(memory_size),
               help="For volumes, such as 8G. Of a larger one the slices in the middle that fit are looked at, and all "
                    "for fractions and surface; several volumes are measured whole. Default: what is free.")  # fmt: skip
@@ -153,7 +154,7 @@ def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_
         memory = free_memory() if values["memory"] is None else values["memory"]
         reads = [
             read_volume(
-                path, values["dataset"], values["voxel_um"], values["slices"], memory, values["crop"] == "square",
+                path, values["dataset"], values["voxel_um"], values["slices"], memory, values["crop"],
                 len(paths) > 1, answer.warn,
             )
             for path in paths
@@ -173,7 +174,8 @@ def _seen(path: Path, read: ReadSlices, answer: Answer, **values: Any) -> Seen:
 
     if read.limit_sentence:
         answer.warn(f"{path}: {read.limit_sentence}")
-    seen = measured(path, read, volumes.box_in(read.record.volume.data, values["crop"] == "square"), answer, **values)
+    box = volumes.box_in(read.record.volume.data, values["crop"])
+    seen = measured(path, read, box, answer, **values)
     if not read.limit_sentence:
         return seen
     slabs = volumes.slabs_of(path, values["dataset"], read, seen.box, answer.counting("slabs"))

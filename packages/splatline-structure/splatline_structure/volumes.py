@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -55,13 +55,16 @@ class ReadSlices:
     limit_sentence: str = ""
 
 
+Crop = Literal["square", "finite", "none"]
+
+
 def read_volume(
     path: Path,
     dataset: str | None,
     voxel_um: Spacing | None,
     slices: tuple[int, int] | None,
     memory: int,
-    crop: bool,
+    crop: Crop,
     whole: bool = False,
     warn: Callable[[str], None] = lambda sentence: None,
 ) -> ReadSlices:
@@ -69,6 +72,7 @@ def read_volume(
 
     Args:
         voxel_um: edges of a voxel (z, y, x); None: the file's.
+        crop: what `box_in` will take: with "finite", values outside its circle may be anything.
         whole: all slices that are asked for, or none.
         warn: is told where the file states other edges.
 
@@ -107,7 +111,7 @@ def read_volume(
         first, end = slices or (0, n_slices)
         if not 0 <= first < end <= n_slices:
             raise DataError(f"--slices {first} {end}: {path} has slices 0 to {n_slices}. Nothing was written.")
-        bytes_a_voxel = BYTES_OF_SQUARE if crop else BYTES_OF_ALL
+        bytes_a_voxel = BYTES_OF_ALL if crop == "none" else BYTES_OF_SQUARE
         most = (memory // math.prod(grid.shape[1:]) - BYTES_BESIDE) // bytes_a_voxel
         least = end - first if whole else min(end - first, _LEAST)
         if most < least:
@@ -115,7 +119,7 @@ def read_volume(
             raise DataError(
                 f"{path}: {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels take {size(needed)}, and "
                 f"{size(memory)} may be used{' for each of several volumes' if whole else ''}. Free memory, give more "
-                f"--memory{', fewer --slices' if whole else ''}{'' if crop else ', --crop square'}, or measure a part "
+                f"--memory{', fewer --slices' if whole else ''}{', --crop square' if crop == 'none' else ''}, or measure a part "
                 "of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
             )
         excess = max(end - first - most, 0)
@@ -133,8 +137,11 @@ def read_volume(
             raise DataError(
                 f"{path} holds {values.shape}; expected {_LEAST} or more voxels a side. Nothing was written."
             )
-        if not np.isfinite(values).all():
-            raise DataError(f"{path} has values that are not finite. Nothing was written.")
+        if crop != "finite" and (share := 1 - np.isfinite(values).mean()):
+            raise DataError(
+                f"{path} has values that are not finite, {share:.2%} of its voxels. If they lie outside the circle of "
+                "the field, --crop finite measures the square inside it. Nothing was written."
+            )
         record = replace(record, volume=Volume(values, grid), length_unit="mm", deviation=None, series=None)
         return ReadSlices(record, fitting, slice(first, end), n_slices, limit_sentence)
 
@@ -168,15 +175,25 @@ def slabs_of(
             tell(taken, len(slabs))
 
 
-def box_in(volume: F32, crop: bool) -> Box:
-    """The square inside the circle of the sample, or of the field where the sample is wider; or all.
+def box_in(volume: F32, crop: Crop) -> Box:
+    """The part of a volume that is measured.
+
+    Args:
+        crop: "square": inside the circle of the sample, or of the field if the sample is wider. "finite": inside the
+            circle that has finite values in all slices. "none": all.
 
     Raises:
-        ValueError: the volume is the same everywhere.
+        ValueError: the volume is the same everywhere, or has values in the square that are not finite.
     """
     nz, ny, nx = volume.shape
-    if not crop:
+    if crop == "none":
         return slice(0, nz), slice(0, ny), slice(0, nx)
+    known = np.isfinite(volume).all(axis=0)
+    if crop == "finite" and not known.all():
+        box = inscribed_box((nz, ny, nx), sample_circle(known[None].astype(np.float32)), 0.0)
+        if not known[box[1:]].all():
+            raise ValueError("it has values that are not finite, and they are not those outside a circle")
+        return box
     y, x = (np.arange(n) - (n - 1) / 2 for n in (ny, nx))
     away, field = np.hypot(y[:, None], x), min(ny, nx) / 2
     mean = volume.mean(axis=0)

@@ -63,7 +63,7 @@ def test_halves_of_some_slices_are_those_of_their_rows(here: Path, monkeypatch: 
     monkeypatch.setattr(
         volumes.recon, "reconstruct", lambda data, *of, **by: shapes.append(data.shape) or reconstruct(data, *of, **by)
     )
-    whole, middle = (read_volume(Path("v.h5"), None, None, part, 10**9, True) for part in (None, (3, 12)))
+    whole, middle = (read_volume(Path("v.h5"), None, None, part, 10**9, "square") for part in (None, (3, 12)))
     scan = Path("scan.h5")
     all_, some = (parts_of(part, scan, 2, pytest.fail, lambda *_: None) for part in (whole, middle))
     assert [shape[1] for shape in shapes] == [16, 16, 13, 13]
@@ -98,7 +98,7 @@ def test_intervals_against_views_are_wider_for_fewer_in_one_box_about_one_axis(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     boxes, axes, reconstruct = [], [], api.reconstruct
-    monkeypatch.setattr(volumes, "box_in", lambda volume, crop: boxes.append(box_in(volume, crop)) or boxes[0])
+    monkeypatch.setattr(volumes, "box_in", lambda *how: boxes.append(box_in(*how)) or boxes[0])
     monkeypatch.setattr(
         api, "reconstruct", lambda *at, **of: axes.append(of["selection"].axis_col) or reconstruct(*at, **of)
     )
@@ -148,15 +148,15 @@ def test_a_scan_is_refused_and_what_is_to_be_done_is_named(here: Path) -> None:
 def test_a_volume_that_is_laid_out_as_a_scan_is_read_by_its_name(here: Path) -> None:
     with h5py.File(here / "volume.h5", "w") as file:
         file["exchange/data"] = np.zeros((9, 10, 11), np.float32)
-    read = read_volume(here / "volume.h5", "exchange/data", (2, 2, 2), None, 10**9, True)
+    read = read_volume(here / "volume.h5", "exchange/data", (2, 2, 2), None, 10**9, "square")
     assert read.record.grid.shape == (9, 10, 11)
     with pytest.raises(DataError, match="if it is a volume, give --dataset"):
-        read_volume(here / "volume.h5", None, (2, 2, 2), None, 10**9, True)
+        read_volume(here / "volume.h5", None, (2, 2, 2), None, 10**9, "square")
 
 
 def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(here: Path) -> None:
     np.save(here / "v.npy", np.random.default_rng(0).random((10, 48, 48), np.float32))
-    read = read_volume(here / "v.npy", None, (2, 2, 2), None, 10**9, True)
+    read = read_volume(here / "v.npy", None, (2, 2, 2), None, 10**9, "square")
     read = replace(read, record=replace(read.record, parameters={"axis_col": 23.5}))
     with pytest.raises(ValueError, match=r"has 10 slices, but rows 0:16 of its scan give 16: give --parts or --quick"):
         parts_of(read, here / "scan.h5", 2, pytest.fail, lambda *_: None)

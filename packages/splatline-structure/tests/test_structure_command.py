@@ -166,7 +166,7 @@ def test_without_contrast_in_the_middle_these_slices_are_named(here: Path) -> No
 
 def test_halves_are_cut_to_the_slices_that_are_measured_or_hold_these_alone(here: Path) -> None:
     np.save(here / "middle.npy", can()[11:28])
-    read = volumes.read_volume(Path("can.npy"), None, (10, 10, 10), (11, 28), 10**9, True)
+    read = volumes.read_volume(Path("can.npy"), None, (10, 10, 10), (11, 28), 10**9, "square")
     halves = command._parts(Path("can.npy"), read, None, quick=False, parts=(Path("can.npy"), Path("middle.npy")))
     for half in halves:
         np.testing.assert_array_equal(half, can()[11:28])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from can_of_balls import BALLS, CIRCLE, SHAPE, WALL, can, inside
 
+from beamline.core.errors import DataError
 from splatline_structure.materials import materials_of
 from splatline_structure.numbers import Rules, structure_of
 from splatline_structure.volumes import box_in, inscribed_box, read_volume, sample_circle, slabs_of
@@ -28,13 +29,13 @@ def test_the_side_is_2_r_cos_45_less_the_margins(radius: float, margin: float) -
 
 def test_the_box_holds_nothing_of_a_cans_wall_and_all_of_a_wide_samples_field() -> None:
     volume = can(noise=0)
-    z, y, x = box_in(volume, True)
+    z, y, x = box_in(volume, "square")
     assert z == slice(0, SHAPE[0]) and np.hypot(y.start - CIRCLE[0], x.start - CIRCLE[1]) < CIRCLE[2] - 3
     assert volume[:, y.start, x.start].max() < WALL / 2
     wide = np.random.default_rng(0).normal(1, 0.1, (10, 80, 80)).astype(np.float32)
-    _, y, x = box_in(wide, True)
+    _, y, x = box_in(wide, "square")
     assert y == x and y.stop - y.start == pytest.approx(80 * np.cos(np.pi / 4) * 0.9, abs=1)
-    assert box_in(wide, False) == (slice(0, 10), slice(0, 80), slice(0, 80))
+    assert box_in(wide, "none") == (slice(0, 10), slice(0, 80), slice(0, 80))
 
 
 @pytest.mark.parametrize(("slices", "read_slices"), [(None, slice(11, 28)), ((2, 40), slice(12, 29))])
@@ -43,11 +44,11 @@ def test_slabs_of_a_volume_larger_than_the_memory_are_all_slices_and_are_counted
 ) -> None:
     path, counted = tmp_path / "can.npy", list[tuple[int, int]]()
     np.save(path, can())
-    read = read_volume(path, None, (10, 10, 10), slices, 13_300_000, True)
+    read = read_volume(path, None, (10, 10, 10), slices, 13_300_000, "square")
     first, end = slices or (0, 40)
     assert (read.slices, read.asked, read.n_slices) == (read_slices, slice(first, end), 40)
     assert "Free memory or give more --memory to measure more slices." in read.limit_sentence
-    box = box_in(read.record.volume.data, True)
+    box = box_in(read.record.volume.data, "square")
     slabs = list(slabs_of(path, None, read, box, lambda n, of: counted.append((n, of))))
     own = [slabs[0], *(slab[1:] for slab in slabs[1:])]
     np.testing.assert_array_equal(np.concatenate(own), can()[first:end, *box[1:]])
@@ -58,7 +59,7 @@ def test_slabs_of_a_volume_larger_than_the_memory_are_all_slices_and_are_counted
 
 @pytest.mark.parametrize("noise", [0.0, 0.1, 0.2])
 def test_balls_in_a_can_are_found_with_number_volume_and_place(noise: float) -> None:
-    box = box_in(can(noise), True)
+    box = box_in(can(noise), "square")
     volume = can(noise)[box]
     structure = structure_of(volume, materials_of(volume, 2).thresholds, (1, 1, 1), Rules(2, 1, side=0))
     particles = structure.particles
@@ -73,3 +74,20 @@ def test_balls_in_a_can_are_found_with_number_volume_and_place(noise: float) -> 
         assert structure.numbered[tuple(np.round(particles.centroid[nearest]).astype(int))] == particles.label[nearest]
     assert {len(each) for each in particles.neighbours} == {0, 1}  # two of them touch
     assert inside(known[0][0], known[0][1])[box][structure.numbered > 0].any()
+
+
+def test_a_volume_that_is_not_finite_outside_a_circle_is_measured_inside_it(tmp_path: Path) -> None:
+    volume = np.random.default_rng(0).random((10, 72, 72)).astype(np.float32)
+    y, x = np.mgrid[:72, :72] - 35.5
+    volume[:, np.hypot(y, x) > 35] = np.nan
+    np.save(tmp_path / "v.npy", volume)
+    for crop in ("square", "none"):
+        with pytest.raises(DataError, match=r"not finite, 2\d\.\d+% .*--crop finite"):
+            read_volume(tmp_path / "v.npy", None, (1, 1, 1), None, 10**9, crop)
+    read = read_volume(tmp_path / "v.npy", None, (1, 1, 1), None, 10**9, "finite")
+    box = box_in(read.record.volume.data, "finite")
+    assert np.isfinite(volume[box]).all() and box[1] == box[2] and box[1].stop - box[1].start in range(47, 52)
+    volume[3, 36, 36] = np.inf
+    with pytest.raises(ValueError, match="not those outside a circle"):
+        box_in(volume, "finite")
+    np.testing.assert_equal(box_in(np.nan_to_num(volume), "finite"), box_in(np.nan_to_num(volume), "square"))

@@ -69,3 +69,14 @@ def test_with_an_output_the_recipe_is_written_and_the_volume_made(folder: Path) 
     assert (folder / "both.yaml").read_text() == read_reconstruction(folder / "both.h5").parameters["recipe"]
     assert beamline("recon", "scan.h5", *OPTIONS, "--write-config", "none.yaml", "-o", "both.h5").exit_code == 5
     assert not (folder / "none.yaml").exists()
+
+
+def test_a_recipe_by_hand_may_name_the_angles_of_all_scans_and_none_is_written(folder: Path) -> None:
+    np.savetxt(folder / "list.txt", np.degrees(SCAN.angles))
+    (folder / "r.yaml").write_text("method: sirt\niterations: 3\nrows: 0:1\naxis: 20.5\nangles: list.txt\n")
+    write_exchange(folder / "bare.h5", SCAN, {"theta": None})
+    made = _made(folder, "recon", "bare.h5", "--config", "r.yaml", "-o", "v.h5", "--no-report")
+    options = ("-m", "sirt", "--iterations", "3", "--rows", "0:1", "--axis", "20.5", "--no-report")
+    whole = _made(folder, "recon", "scan.h5", *options, "-o", "w.h5")
+    np.testing.assert_allclose(made.volume.data, whole.volume.data, rtol=1e-4, atol=1e-6)
+    assert "angles" not in str(made.parameters["recipe"])

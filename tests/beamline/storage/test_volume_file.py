@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from beamline.core.errors import DataError
 from beamline.storage.volume_file import read_volume
@@ -142,3 +143,36 @@ def test_ome_states_the_edges_of_a_voxel_and_a_bare_tiff_none(tmp_path: Path) ->
         tmp_path / "bare.tif", np.ones((4, 5, 6), np.uint16), photometric="minisblack", resolution=(72, 72)
     )
     assert read_volume(tmp_path / "bare.tif")[1] is None
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "PNG", "jpg", "tif"])
+def test_slices_of_other_programs_are_a_volume_without_the_preview_beside_them(tmp_path: Path, suffix: str) -> None:
+    slices = np.repeat(np.arange(11, dtype=np.uint8) * 20, 8 * 10).reshape(11, 8, 10)
+    for z, one in enumerate(slices):
+        Image.fromarray(one).save(tmp_path / f"rec_{z}.{suffix}")
+    Image.fromarray(slices[0, :3]).save(tmp_path / f"rec_spr.{suffix}")
+    for name, content in (
+        ("rec_.log", "[Reconstruction]\nPixel Size (um)=7.95\n"),
+        ("Thumbs.db", "x"),
+        (".DS_Store", "x"),
+    ):
+        (tmp_path / name).write_text(content)
+    values, spacing = read_volume(tmp_path)
+    np.testing.assert_allclose(np.asarray(values, np.float64), slices, atol=2 * (suffix == "jpg"))
+    assert spacing == pytest.approx((0.00795,) * 3)
+    (tmp_path / "rec_.log").write_text("[2026-05-03] begun\n  taken\n")
+    assert read_volume(tmp_path)[1] is None
+    for z in range(2):
+        Image.fromarray(slices[z]).save(tmp_path / f"other_{z}.{suffix}")
+    with pytest.raises(DataError, match=r"several series of images: 11 such as rec_0.*2 of other_#"):
+        read_volume(tmp_path)
+
+
+def test_coloured_pictures_are_no_volume(tmp_path: Path) -> None:
+    grey = np.full((4, 5, 3), 90, np.uint8)
+    Image.fromarray(grey).save(tmp_path / "s_0.png")
+    assert read_volume(tmp_path)[0].tolist() == [[[90] * 5] * 4]
+    grey[1, 1, 0] = 200
+    Image.fromarray(grey).save(tmp_path / "s_1.png")
+    with pytest.raises(DataError, match="it has colours"):
+        read_volume(tmp_path)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -16,7 +18,8 @@ from beamline.storage.readers.images.image_angles import NamedAngles, angles_in
 from drivers.base.frame import FrameKind
 
 _REFERENCE = re.compile(r"(?:^|[^a-z])(dark|flat|white|open[ _-]?beam)")
-_SHORT = re.compile(r"(?:^|[^a-z])(ob|df|dc)(?![a-z])")  # of neutron imaging: open beam, dark field, dark current
+# Of neutron imaging (open beam, dark field, dark current), and of TESCAN's XRE (io, di).
+_SHORT = re.compile(r"(?:^|[^a-z])(ob|df|dc|io|di)(?![a-z])")
 _PLAIN = re.compile(  # words of references, and those that go with them
     r"open[ _-]?beam|dark|flat|white|ob|df|dc|fields?|images?|frames?|pre|post|before|after|s\b|current"
 )
@@ -38,15 +41,8 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
         DataError: no series can be recognised as the projections.
     """
     within = _without_common_folder(names)
-    kinds = {name: _by(_REFERENCE, short) for name, short in zip(names, within, strict=True)}
-    if not names:
-        return kinds
-    kinds |= {
-        name: _by(_SHORT, short)
-        for name, short in zip(names, within, strict=True)
-        if kinds[name] is FrameKind.PROJECTION
-    }
-    if FrameKind.PROJECTION in kinds.values():
+    kinds = {name: _kind_of(short) for name, short in zip(names, within, strict=True)}
+    if not names or FrameKind.PROJECTION in kinds.values():
         return kinds
     series: dict[str, list[str]] = {}
     for name, short in zip(names, within, strict=True):
@@ -75,12 +71,13 @@ def _sample_of(series: dict[str, list[str]], kinds: dict[str, FrameKind]) -> str
     return largest if both and len(series[largest]) > len(others) else None
 
 
-def _by(words: re.Pattern[str], name: str) -> FrameKind:
+def _kind_of(name: str) -> FrameKind:
     """The kind of image by a file's name relative to the scan's folder, which takes precedence over its folders."""
-    for part in reversed(name.lower().split("/")):
-        match = words.search(part)
-        if match is not None:
-            return FrameKind.DARK if match[1].startswith("d") else FrameKind.FLAT
+    for words in (_REFERENCE, _SHORT):
+        for part in reversed(name.lower().split("/")):
+            match = words.search(part)
+            if match is not None:
+                return FrameKind.DARK if match[1].startswith("d") else FrameKind.FLAT
     return FrameKind.PROJECTION
 
 
@@ -147,7 +144,7 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
     half_turn = [] if one_series else _half_a_turn_on(series)
     series = [name for name in series if name not in {*half_turn}]
     stated = angles_in(series)
-    places = _places(path, stated, one_series=one_series)
+    places = _places(path, stated, images, one_series=one_series)
     taken = np.argsort(places, kind="stable") if stated.radians is None else np.lexsort((stated.radians, places))
     references = [name for kind in _REFERENCES for name in images if kinds[name] is kind]
     within = dict(zip(images, _without_common_folder(images), strict=True))
@@ -173,16 +170,33 @@ def _half_a_turn_on(series: list[str]) -> list[str]:
     return named if 2 * len(named) < len(series) and len(named) == sum(map(bool, stated.values())) else []
 
 
-def _places(path: object, stated: NamedAngles, *, one_series: bool) -> NDArray[np.int64]:
-    """The number of each image of a series, by its name without an angle. DataError: there are several series."""
+def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_series: bool) -> NDArray[np.int64]:
+    """The number of each image of a series, by its name without an angle. DataError: there are several series.
+
+    Series of which each counts anew follow one another, as where their names say of which kind they are.
+
+    Args:
+        images: of the scan, also those of other kinds.
+    """
     plain = stated.plain
     counted, several = _numbers(plain), len({_template(name, stated.doubt) for name in plain}) > 1
+    if counted is not None and several and one_series and np.unique(counted).size < counted.size:
+        within = _without_common_folder(plain)
+        apart = sorted(range(len(plain)), key=lambda i: (_rank(within[i]), _template(plain[i]), counted[i]))
+        return np.argsort(apart)
     if counted is not None and (one_series or not several):
         return counted
     if len(plain) > 1 and (several or (stated.radians is None and not stated.doubt)):
-        raise DataError(_several_series(path, plain))
+        raise DataError(_several_series(path, plain, [] if one_series else images))
     ordered = {name: i for i, name in enumerate(natural_sorted(set(plain)))}
     return np.array([ordered[name] for name in plain], np.int64)
+
+
+def _rank(name: str) -> int:
+    """Where the frames of a kind stand in a scan: darks, flats, views, and references that were taken afterwards."""
+    kind = _kind_of(name)
+    place = (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION).index(kind)
+    return place + 3 * (kind in _REFERENCES and _AFTER.search(name.lower()) is not None)
 
 
 def _template(name: str, doubt: str = "") -> str:
@@ -217,24 +231,43 @@ def _counting(names: list[str]) -> list[int] | None:
     counting = [n for n in varying if len(set(columns[n])) == len(names)]
     dates = {n for n in varying if min(columns[n]) >= _DATE}
     if not counting or set(varying) - {*counting} - dates:
-        return None
+        decimals = [re.findall(r"\d+[.,]\d+", name) for name in names]
+        values = [float(each[0].replace(",", ".")) for each in decimals if len(each) == 1]
+        ranks = np.unique(values, return_inverse=True)[1].tolist()
+        return ranks if len({*ranks}) == len(names) else None  # such as angles: they tell the order alone
     return columns[min(counting, key=lambda n: (max(columns[n]) - min(columns[n]), columns[n], -n))]
 
 
 def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
     """The numbers of images that count frames, not dates."""
     numbers = _numbers(names)
-    return None if numbers is None or np.ptp(numbers) > COUNTED * numbers.size else numbers
+    counts = numbers is not None and np.ptp(numbers) <= COUNTED * np.unique(numbers).size == COUNTED * numbers.size
+    return numbers if counts else None
 
 
-def _several_series(path: object, names: Sequence[str]) -> str:
+def places_of(names: Sequence[str]) -> str:
+    """Which places in a scan the images of each name have, such as "dark_#.tif 0:5, s_#.tif 5:95"."""
+    of_names = groupby(enumerate(names), lambda each: re.sub(r"\d+", "#", each[1]))
+    runs = [(name, [place for place, _ in some]) for name, some in of_names]
+    listed = [f"{name} {places[0]}:{places[-1] + 1}" for name, places in runs[:_LISTED]]
+    return ", ".join(listed) + ", ..." * (len(runs) > _LISTED)
+
+
+_LISTED = 6  # series that a sentence names
+
+
+def _several_series(path: object, names: Sequence[str], images: Sequence[str]) -> str:
     templates = [_template(name) for name in names]
     if len(set(templates)) == 1:
         templates = [re.sub(r"\d+(?=\D*$)", "", name) for name in names]
-    kinds = sorted(set(templates))
-    numbers = ", ".join(f"{templates.count(kind)} of {kind!r}" for kind in kinds[:6])
+    numbers = ", ".join(f"{templates.count(kind)} of {kind!r}" for kind in sorted(set(templates))[:_LISTED])
+    places = ""
+    with suppress(DataError):  # no order where the same names are several series again
+        in_their_order = in_order(path, images, one_series=True).names if images else []
+        places = f", counted from 0 in this order: {places_of(in_their_order)}" * bool(images)
     return (
         f"{path} holds several series of images: {numbers}. Name darks and flats so (dark_0001.tif, flat_0001.tif), or "
-        "give the folder of the projections, and the others apart, with --darks and --flats. Where all are one series, "
-        "say which images are which: --frames darks=0:5,flats=5:10. Angles in names are read as in a_angle-12.5_01.tif."
+        "give the folder of the projections, and the others apart, with --darks and --flats. Or say which images are "
+        f"which: --frames darks=0:5,flats=5:10, with none=10:12 for what is left out{places}. Angles in names are read "
+        "as in a_angle-12.5_01.tif."
     )

@@ -15,7 +15,7 @@ import os
 import re
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -35,9 +35,11 @@ from beamline.storage.hdf5 import UnreadableError
 from beamline.storage.packing import packing
 from beamline.storage.readers.base import WHOLE, NotUsed, Opening, ScanFormat, ScanSource, frame_indices
 from beamline.storage.readers.frames import Frames
-from beamline.storage.readers.images.image_names import NamedImages, in_order
+from beamline.storage.readers.images.image_names import NamedImages, in_order, places_of
+from beamline.storage.readers.images.tiff_stack import TiffStackSource
 from beamline.storage.readers.nexus import differing
 from beamline.storage.readers.side_files import offered
+from beamline.storage.readers.stacks import open_stacks
 from beamline.storage.readers.tiff import (
     DECODERS,
     SUFFIXES,
@@ -51,6 +53,7 @@ from beamline.storage.readers.tiff import (
     refuse_volume,
     stated,
 )
+from beamline.storage.readers.transforms import in_parts
 from beamline.storage.structure import is_blank
 from beamline.storage.writers.rows import ScanEnding
 from drivers.base.frame import FrameKind
@@ -60,8 +63,13 @@ LARGEST_IMAGE = 2**30  # bytes of an image: 16,000 x 16,000 pixels of 4 bytes
 _LOOKED, _REFERENCES = 2**30, 1000  # bytes, and number, of darks and flats that are read to tell their type
 _MOST_NUMBERS = 2**20  # from the first number of a series to its last
 _TRIED = 3  # first images of a series, of which one must be readable, as the others are then
+_FEW_STACKS = 20  # files of a folder that may be stacks; all are open at once
 _SCALES, _PICTURE = "scaleoffset.json", ".png"
 ANGLE_FILE = re.compile(r"(?:^|[^a-z])(angle|theta)[^/]*\.(txt|csv|dat)$|(?:^|/)(angles?|thetas?)\.npy$")
+
+
+class _StacksError(DataError):
+    """A file holds more than an image."""
 
 
 class TiffSeriesSource(ScanSource):
@@ -94,13 +102,14 @@ class TiffSeriesSource(ScanSource):
             samples = [*self._readable(some), *self._readable(series[:_TRIED], at_least=1)[:1]]
             self.shape = samples[-1][0]
             self.dtype = np.result_type(*(dtype for _, dtype in samples))
-            self._texts = [name for name in names if ANGLE_FILE.search(name.lower()) and not name.endswith(".npy")]
+            self._texts = [name for name in names if ANGLE_FILE.search(name.lower())]
             self.packing = next((self._text(name) for name in names if name.rpartition("/")[2] == _SCALES), "")
         missing, gaps = _left_out(images)
         self.stated_ending, self.not_used = ScanEnding(missing=missing), self.not_used + offered(self)
         if images.half_turn:
             self.not_used += (NotUsed(images.half_turn[0], count(len(images.half_turn), "image"), _BESIDE, False),)
-        self.facts = {"series": f"{series[0]} ... {series[-1]}"} | ({"missing_numbers": gaps} if gaps else {})
+        self.facts = {"series": f"{series[0]} ... {series[-1]}", "places": places_of(images.names)}
+        self.facts |= {"missing_numbers": gaps} if gaps else {}
         if np.isfinite(self.table.angles).any() and len(self._texts) != 1:
             self.facts |= {"angles_from": "the names of the files"}
         if images.doubt:
@@ -195,7 +204,7 @@ class TiffSeriesSource(ScanSource):
         return images
 
     def _text(self, name: str) -> str:
-        return decoded(self._bytes(name, TEXT), "replace")  # a comment in another alphabet; numbers are told later
+        return _text_of(name, self._bytes(name, TEXT))
 
     def _image(self, name: str) -> NDArray[Any]:
         content = self._bytes(name, LARGEST_IMAGE)
@@ -214,11 +223,20 @@ class TiffSeriesSource(ScanSource):
         if not shape or math.prod(shape) == 0:
             raise UnreadableError(f"{name} in {self.path} cannot be read as an image (it contains none).")
         if len(shape) != 2:
-            raise DataError(
-                f"{name} in {self.path} is {shape}; expected one grey image a file. Give stacks as FILE --append FILE."
+            raise _StacksError(
+                f"{name} in {self.path} is {shape}; expected one grey image a file, or, in a folder of at most "
+                f"{_FEW_STACKS} files, a stack of grey images in each. Give a stack as FILE, with --darks FILE and "
+                "--flats FILE."
             )
         require_real(dtype, f"{name} in {self.path}")
         return shape
+
+
+def _text_of(name: str, content: bytes) -> str:
+    """The content of a text file, or of an .npy with a number a line."""
+    if name.lower().endswith(".npy"):
+        return "\n".join(map(str, np.ravel(DECODERS[".npy"](io.BytesIO(content))).tolist()))
+    return decoded(content, "replace")  # a comment in another alphabet; numbers are told later
 
 
 def _open_zip(path: Path) -> zipfile.ZipFile:
@@ -300,14 +318,44 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         return Frames(TiffSeriesSource(path.parent, listed=[path.name]), path=path)
     if (scene := _scene_of(path)) is not None:
         return _open_scene(scene)
-    source = TiffSeriesSource(path, one_series=opening.one_series)
+    try:
+        source = TiffSeriesSource(path, one_series=opening.one_series)
+    except _StacksError:
+        names = [item.name for item in path.iterdir()] if path.is_dir() else []
+        files = images_among([name for name in names if not ANGLE_FILE.search(name.lower())])
+        if not 0 < len(files) <= _FEW_STACKS:
+            raise
+        return _of_stacks(path, in_order(path, files))
     alone = opening.counts and source.in_order and path.is_dir() and not opening.one_series
     return _with_values(_with_references_beside(source) if alone else source)
 
 
+def _of_stacks(path: Path, images: NamedImages) -> ScanSource:
+    """The scan of a folder whose files hold stacks of images, of kinds that their names tell."""
+    tiff = images.names[0].lower().endswith(SUFFIXES)
+    with ExitStack() as opened:
+        files = [
+            opened.enter_context(TiffStackSource(path / name) if tiff else open_stacks(path / name, None))
+            for name in images.names
+        ]
+        kinds = np.repeat(images.kinds, [len(file.table) for file in files])
+        places = ", ".join(f"{len(file.table)} of {name}" for file, name in zip(files, images.names, strict=True))
+        joined = in_parts(files[:-1], files[-1], path)
+        opened.pop_all()
+    texts = [item for item in path.iterdir() if ANGLE_FILE.search(item.name.lower())]
+    of_views = (texts[0].name, _text_of(texts[0].name, texts[0].read_bytes())) if len(texts) == 1 else None
+    return Frames(
+        joined,
+        table=lambda known: replace(known, kinds=kinds),
+        in_order=False,
+        attributes={"places": places},
+        angle_text=of_views,
+    )
+
+
 def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
     """The scan of the folder above, where its views are those of this one, and others are darks or flats."""
-    with suppress(DataError):
+    with suppress(Exception):  # what lies there is only looked at, and may be anything
         above = TiffSeriesSource(source.path.absolute().parent)
         views = [Path(above.names[i]).parts[0] for i in above.table.views]
         beside = sorted({Path(name).parts[0] for name in above.names} - {*views})

@@ -301,3 +301,10 @@ def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> Non
     assert found.axis_col == pytest.approx(AXIS, abs=0.15)
     left = found.projections.data - ellipsoid_shadow(replace(found.geometry, axis_col=AXIS), AXES, CENTRE)
     assert np.abs(left).max() < 0.02
+
+
+@pytest.mark.parametrize("mark", [" ", ","])
+def test_vectors_of_astra_without_names_get_the_way_to_name_them(tmp_path: Path, mark: str) -> None:
+    np.savetxt(tmp_path / "s.geom", np.eye(12)[:3], delimiter=mark)
+    with pytest.raises(ValueError, match=r"12 numbers a line.*cone_vec=np.loadtxt\('s\.geom'\)"):
+        read_poses(str(tmp_path / "s.geom"))

@@ -202,3 +202,26 @@ def test_axes_that_are_unknown_are_named(tmp_path: Path) -> None:
         file["exchange/data"].attrs["axes"] = "a:b:c"
     (hit,) = [hit for hit in validate(path) if hit.rule == "not-used"]
     assert hit.severity == "warning" and "exchange/data@axes, a:b:c" in hit.message
+
+
+@pytest.mark.parametrize("where", ["attributes", "process", "radians", "two", "elsewhere"])
+def test_start_and_step_of_the_rotation_stand_for_theta(tmp_path: Path, parts: Parts, where: str) -> None:
+    del parts["theta"]
+    path = store(tmp_path / "s.h5", parts)
+    with h5py.File(path, "a") as file:
+        if where == "attributes":
+            file["exchange"].attrs.update(rotation_start=10.0, rotation_step=36.0, exposure_start=3.0)
+        else:
+            group = file.create_group("exposure" if where == "elsewhere" else "process/acquisition/rotation")
+            group["start"], group["step"] = np.radians([10.0, 36.0]) if where == "radians" else (10.0, 36.0)
+            for name in ("start", "step"):
+                group[name].attrs["units"] = "rad" if where == "radians" else "deg"
+        if where == "two":
+            file["process"].attrs["rotation_start_stated"] = 0.0
+            file["process/acquisition/rotation_start"] = 0.0
+    if where in ("two", "elsewhere"):
+        with pytest.raises(DataError, match=r"no /exchange/theta.*--angles FILE"):
+            open_scan(path)
+    else:
+        with open_scan(path) as source:
+            np.testing.assert_allclose(np.degrees(source.table.angles[-5:]), 10 + 36 * np.arange(5))

@@ -110,3 +110,20 @@ def test_a_number_stands_for_darks_of_every_pixel(tmp_path: Path, monkeypatch: p
     assert load_images("300", FrameKind.DARK, (2, 3)).max() == 7
     with pytest.raises(DataError, match="cannot be read"):
         load_images("301.5", FrameKind.DARK, (2, 3))
+
+
+@pytest.mark.parametrize("first", [0, 10])
+def test_flats_of_several_places_stand_where_they_were_taken(tmp_path: Path, first: int) -> None:
+    """As nabu keeps those of BLISS: a dataset for each place, named by the number of the frame."""
+    with h5py.File(tmp_path / "flats.h5", "w") as file:
+        for n, (place, counts) in enumerate(((0, 900), (45, 800), (90, 700))):
+            file[f"entry0000/flats/{first + place}"] = np.full(SHAPE, counts, np.float32)
+            file[f"entry0000/darks/{n}"] = np.full(SHAPE, n, np.float32)
+    views = np.arange(10, dtype=np.float32)[:, None, None] * np.ones(SHAPE, np.float32)
+    options = SourceOptions(tmp_path / "v.npy", darks=tmp_path / "flats.h5", flats=tmp_path / "flats.h5")
+    np.save(tmp_path / "v.npy", views)
+    with open_scan(options) as source:
+        assert source.table.kinds.tolist() == [2, 2, 2, 1, *[0] * 5, 1, *[0] * 5, 1]
+        assert source.read(source.table.flats)[:, 0, 0].tolist() == [900, 800, 700]
+        assert source.read([-1, 0, 4])[:, 1, 1].tolist() == [700, 0, 0]
+        np.testing.assert_array_equal(source.read(source.table.views, slice(1, 3)), views[:, 1:3])

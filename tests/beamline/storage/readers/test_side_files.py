@@ -54,7 +54,18 @@ YXLON = f"""<?xml version="1.0"?>
 DIONDO = f"""<Scan><ScanParameter><HelixMode>false</HelixMode><Laminography>false</Laminography></ScanParameter>
 <Geometrie><SourceDetectorDist>300</SourceDetectorDist><SourceObjectDist>60</SourceObjectDist></Geometrie>
 <Recon><ProjectionPixelSizeX>0.2</ProjectionPixelSizeX><ProjectionCount>{N}</ProjectionCount></Recon></Scan>"""
+TESCAN = f"""[General]
+Project = "walnut"
+[CT-parameters IN]
+SOD = "60.000000"
+SDD = "300.000000"
+Pixel size = "0.200000"
+Start angle = "10.000000"
+Last angle = "310.000000"
+# projections = "{N}"
+"""
 FILES = {
+    "data settings XRE.txt": (TESCAN, 10.0),
     "s.xtekct": (NIKON, 10.0),
     "s.log": (SKYSCAN, 0.0),
     "s.pca": (PHOENIX, 0.0),
@@ -71,6 +82,42 @@ def images(tmp_path: Path) -> Path:
     for i in range(N):
         tifffile.imwrite(folder / f"s_{i:04d}.tif", np.full(SHAPE, 50_000 + i, np.uint16))
     return folder
+
+
+_OF_A_SCRIPT = """[2026-05-03 10:12:01] scan begins
+exposure 0.1 s
+Traceback (most recent call last):
+  File "scan.py", line 212, in take
+TimeoutError: no frame
+"""
+TEXTS = {
+    "s.log": _OF_A_SCRIPT.encode(),
+    "settings.log": b"[Scan]\nSample\n  name: cell\n  mounted by: AB\n",
+    "s.xtekct": b"\xff\xfe[\x00X\x00",
+    "x.pca": b"[\x00\x01]\n\x02\n  \x03\n",
+    "y.pca": b'{"a": [1, {"b": 2}], "geometry": 3}',
+    "deep.pca": b'{"a":' * 3000 + b"1" + b"}" * 3000,
+    "deep.xml": b"<a>" * 3000 + b"</a>" * 3000,
+    "empty.log": b"",
+    "endless.pca": PHOENIX.replace(f"={N}", "=1e999").encode(),
+    "many.pca": PHOENIX.replace(f"={N}", "=9e11").encode(),
+}
+
+
+@pytest.mark.parametrize("name", TEXTS)
+@pytest.mark.parametrize("above", [False, True])
+def test_any_text_beside_images_stops_no_scan(images: Path, name: str, above: bool) -> None:
+    (images.parent / name if above else images / name).write_bytes(TEXTS[name])
+    with open_scan(images) as source:
+        assert len(source.table) == N
+        assert source.not_used == ()
+
+
+@pytest.mark.parametrize("name", TEXTS)
+def test_any_text_that_is_named_is_refused_in_a_sentence(images: Path, name: str) -> None:
+    (images / name).write_bytes(TEXTS[name])
+    with pytest.raises(DataError, match=r"cannot be read as|is not a supported file|states no"):
+        read_side_file(images / name)
 
 
 @pytest.mark.parametrize("name", ["s.log", "s.xtekct", "s.pca"])
@@ -112,7 +159,8 @@ def test_distances_pixels_and_angles_are_taken(images: Path, name: str, encoding
         assert (source.cone, source.pixel_size_mm) == (None, None)
         assert np.isnan(source.table.angles).all()
         assert [field.where for field in source.not_used] == [name]
-    assert [f.message for f in validate(images) if f"--scanner-file {side}" in f.message]
+    named = f'"{side}"' if " " in name else side
+    assert [f.message for f in validate(images) if f"--scanner-file {named}" in f.message]
     with open_scan(SourceOptions(images, side_file=side, quantity="counts")) as source:
         assert source.cone == pytest.approx((60, 300))
         assert source.pixel_size_mm == pytest.approx(0.2)

@@ -121,3 +121,16 @@ def test_views_of_two_energies_are_refused_and_one_can_be_chosen(tmp_path: Path)
         open_scan(SourceOptions(path, frames="energy=25"))
     with pytest.raises(DataError, match="states no energy of each frame"):
         open_scan(SourceOptions(nxtomo(tmp_path / "t.nx"), frames="energy=25"))
+
+
+def test_frames_that_are_left_out_alone_keep_the_kinds_of_the_others(tmp_path: Path) -> None:
+    pixels = np.zeros((8, *SHAPE), np.uint16)
+    path = write_nxtomo(tmp_path / "s.nxs", pixels, [2, 1, *[0] * 6], 10.0 * np.arange(8))
+    with open_scan(SourceOptions(path, frames="none=3:5+7:8")) as source:
+        assert source.table.kinds.tolist() == [DARK, FLAT, VIEW, NONE, NONE, VIEW, VIEW, NONE]
+    angles = np.array([0, np.nan, 20, 30, np.nan, 50])
+    (finding,) = [each.message for each in validate(SourceOptions(path, angles=angles)) if "No angle" in each.message]
+    assert "--frames none=3:4+6:7." in finding  # as it is given below
+    for given in (angles, angles[np.isfinite(angles)]):  # of all views, or of those that are left
+        with open_scan(SourceOptions(path, angles=given, frames="none=3:4+6:7")) as source:
+            np.testing.assert_array_equal(source.table.angles[source.table.views], [0, 20, 30, 50])

@@ -190,3 +190,46 @@ def test_other_images_beside_tiffs_are_no_frames(tmp_path: Path) -> None:
     Image.fromarray(np.zeros(SHAPE, np.uint8)).save(tmp_path / "preview.png")
     with open_scan(tmp_path) as source:
         assert source.table.kinds.tolist() == [0] * 4
+
+
+_XRE = ["di000000.tif", "io000000.tif", "io000001.tif", *(f"scan_{i:06d}.tif" for i in range(VIEWS))]
+
+
+def test_series_that_each_count_anew_stay_apart_and_say_their_places(tmp_path: Path) -> None:
+    """As of TESCAN and FleXray (io, di), and of names that are not known, whose kinds the caller says."""
+    for names, scan in ((_XRE, "xre"), ([name.replace("io", "bl").replace("di", "a") for name in _XRE], "others")):
+        _written(tmp_path / scan, names)
+        with open_scan(SourceOptions(tmp_path / scan, frames="darks=0:1,flats=1:3")) as source:
+            assert source.table.kinds.tolist() == [DARK, FLAT, FLAT, *[VIEW] * VIEWS]
+            assert source.read(slice(None))[:, 0, 0].tolist() == list(range(VIEWS + 3))
+            assert f"scan_#.tif 3:{VIEWS + 3}" in str(source.attributes["places"])
+    with open_scan(tmp_path / "xre") as source:
+        assert source.table.kinds.tolist() == [DARK, FLAT, FLAT, *[VIEW] * VIEWS]
+    with pytest.raises(
+        DataError, match=rf"several series.*none=10:12.*a#\.tif 0:1, bl#\.tif 1:3, scan_#\.tif 3:{VIEWS + 3}"
+    ):
+        open_scan(tmp_path / "others")
+
+
+@pytest.mark.parametrize("pattern", ["p_{a:.1f}.tif", "p_{a:07.3f}.tif", "{a:.1f}_{i:04d}.tif"])
+def test_decimals_in_names_tell_the_order(tmp_path: Path, pattern: str) -> None:
+    _written(tmp_path, [pattern.format(a=1.5 * i, i=i) for i in range(VIEWS)])
+    angles = np.arange(VIEWS) * 15.0
+    np.savetxt(tmp_path / "angles.txt", angles)
+    with open_scan(tmp_path) as source:
+        assert source.read(range(VIEWS))[:, 0, 0].tolist() == list(range(VIEWS))
+        np.testing.assert_allclose(np.degrees(source.table.angles), angles)
+
+
+@pytest.mark.parametrize("suffix", ["tif", "npy"])
+def test_a_folder_of_stacks_is_one_scan(tmp_path: Path, suffix: str) -> None:
+    stacks = {"tomo": (VIEWS, 7), "flat": (6, 90), "dark": (5, 1)}
+    for name, (n, counts) in stacks.items():
+        frames = np.arange(n)[:, None, None] + np.full(SHAPE, counts, np.uint16)
+        write = {"tif": tifffile.imwrite, "npy": np.save}[suffix]
+        write(tmp_path / f"{name}.{suffix}", frames.astype(np.uint16))
+    np.save(tmp_path / "theta.npy", np.arange(VIEWS) * 15.0)
+    with open_scan(SourceOptions(tmp_path, quantity="counts")) as source:
+        assert source.table.kinds.tolist() == [DARK] * 5 + [FLAT] * 6 + [VIEW] * VIEWS
+        assert source.read([4, 5, 11, -1])[:, 0, 0].tolist() == [5, 90, 7, 7 + VIEWS - 1]
+        np.testing.assert_allclose(np.degrees(source.table.angles[source.table.views]), np.arange(VIEWS) * 15.0)
