@@ -23,7 +23,7 @@ from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig
 from splatline_areadetector.counters import Counters, Gap, Silence, losses_told
-from splatline_areadetector.guides import EXPOSURE, Guide
+from splatline_areadetector.guides import EXPOSURE, Guide, seconds_of
 from splatline_areadetector.plan import RidePlan
 from splatline_areadetector.sorter import NewEpoch, Outside, Place, Sorter
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
@@ -83,6 +83,7 @@ class RiddenFrames:
         self._gaps: list[Gap] = []
         self._overflowed: set[int] = set()
         self._last: ArrayFrame | None = None
+        self._unused: dict[str, list[int]] = {}  # numbers of frames that came all the same, by what is wrong with them
         self._block, self._block_kind, self._in_block = -1, "", 0
         self._gone = self._told_of_outside = False
         self._told_pause = self._epoch = ""
@@ -177,10 +178,17 @@ class RiddenFrames:
         try:
             counts = frame.counts()
         except ValueError as error:
-            self._sorter.lose(place)
-            self._warn(f"Frame {frame.unique_id}: {error}. It counts as missing.")
+            self._cannot_use(frame, place, str(error))
             return None
         return self._frame(frame, counts, place)
+
+    def _cannot_use(self, frame: ArrayFrame, place: Place, why: str) -> None:
+        self._sorter.lose(place)
+        if why not in self._unused:
+            self._warn(
+                f"Frame {frame.unique_id}: {why}. It counts as missing; of others like it this is said at the end."
+            )
+        self._unused.setdefault(why, []).append(frame.unique_id)
 
     def _add_gap(self, ids: range, before: ArrayFrame, after: ArrayFrame) -> None:
         still = self._stream.stood_still(before.time, after.time)
@@ -200,13 +208,12 @@ class RiddenFrames:
         kind, angle = place.kind, math.nan
         if kind is FrameKind.PROJECTION:
             angle = self._guide.angle(frame, place.trigger)
-            self._views += 1
             if math.isnan(angle):
                 kind = FrameKind.INVALID
-                self._sorter.lose(place)
-                self._warn(f"Nothing tells the angle of frame {frame.unique_id}: it is kept as an invalid row.")
-        exposure = frame.attributes.get(EXPOSURE)
-        seconds = float(exposure) if isinstance(exposure, int | float) else self._plan.exposure(place.kind)
+                self._cannot_use(frame, place, "nothing tells its angle, so that it is kept as an invalid row")
+            else:
+                self._views += 1
+        seconds = seconds_of(frame.attributes.get(EXPOSURE)) or self._plan.exposure(place.kind)
         self._in_block += 1
         return Frame(counts, kind, self._row, place.trigger, frame.unique_id, angle, frame.time, seconds)
 
@@ -275,8 +282,12 @@ class RiddenFrames:
                     first, last = (math.degrees(angles[missing[end]]) for end in (0, -1))
                     at = f" (from {first:.4g}° to {last:.4g}°)"
                 words.append(f"{len(missing)} of {block.n} {noun}s are missing: {spans(missing)}{at}.")
-                if at and missing[0] == block.n - len(missing) and ended:
+                if at and 0 < missing[0] == block.n - len(missing) and ended:
                     words.append(self._first_or_last(missing))
+        for why, ids in self._unused.items():
+            words.append(f"Of {len(ids)} frames that came ({spans(ids)}), each: {why}.")
+        if self._unused and self._guide.status:
+            words.append(f"Now: {self._guide.status}.")
         words += losses_told(self._gaps, self._overflowed, self._ride.counters)
         if self._sorter.repeats:
             words.append(f"{count(self._sorter.repeats, 'frame')} came twice and were stored once.")
@@ -307,6 +318,12 @@ class RiddenFrames:
                 f"far as it goes.{told}"
             )
         if self._epoch:
-            raise EpochEndedError(f"{told.strip()} The file ends there, as {self._epoch}.{_OTHERS}", self.missing)
+            raise EpochEndedError(f"{told.strip()} The file ends there, as {self._epoch}.{self._others}", self.missing)
         if self.missing:
-            raise LedgerError(f"{told.strip()}{_OTHERS}", self.missing)
+            raise LedgerError(f"{told.strip()}{self._others}", self.missing)
+
+    @property
+    def _others(self) -> str:
+        return (
+            _OTHERS if self._views else f" The file has {count(self._row, 'frame')}, and no projection with an angle."
+        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -20,7 +19,7 @@ from drivers.base.frame import FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig, TomoscanAngles
 from splatline_areadetector.counters import Counters, Silence, refuse_mistakes
-from splatline_areadetector.guides import EXPOSURE, Guide, guide_of
+from splatline_areadetector.guides import EXPOSURE, Guide, guide_of, seconds_of
 from splatline_areadetector.plan import PlannedBlock, RidePlan, ready_of
 from splatline_areadetector.ridden import SLICE, EpochEndedError, Images, RiddenFrames, Ride, outside_sentence
 from splatline_areadetector.stream import FrameStream, Refused
@@ -67,7 +66,8 @@ def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
     stream, guide = ride.stream, ride.guide
     silence = Silence(stream, ride.counters, ride.config.ride.silence_s, ride.say, lambda: "Nothing was recorded.")
     told = False
-    ride.say(f"Waiting for the first frame of a scan from {stream.name}{_shown(ride)}")
+    now = f" Now: {guide.status}." if guide.status else ""
+    ride.say(f"Waiting for the first frame of a scan from {stream.name}{_shown(ride)}{now}")
     while not ride.stop.stopping:
         item = stream.next(SLICE)
         if isinstance(item, Refused):
@@ -103,10 +103,9 @@ def _shown(ride: Ride) -> str:
 
 def _exposure(ride: Ride, planned: float | None, first: ArrayFrame) -> float | None:
     """s of a view, by the first that tells: configuration, plan, frame, camera; None: nothing does."""
-    camera, told = ride.counters.camera, first.attributes.get(EXPOSURE)
-    by_frame = float(told) if isinstance(told, int | float) else None
-    by_camera = None if camera is None else camera.number("AcquireTime_RBV")
-    return ride.config.ride.exposure_s or planned or by_frame or by_camera or None
+    camera, by_frame = ride.counters.camera, seconds_of(first.attributes.get(EXPOSURE))
+    by_camera = None if camera is None else seconds_of(camera.number("AcquireTime_RBV"))
+    return ride.config.ride.exposure_s or seconds_of(planned) or by_frame or by_camera
 
 
 def _with_exposure(plan: RidePlan, ride: Ride, first: ArrayFrame) -> RidePlan:
@@ -118,9 +117,9 @@ def _with_exposure(plan: RidePlan, ride: Ride, first: ArrayFrame) -> RidePlan:
             "Set ride.exposure_s. Nothing was recorded."
         )
     camera = ride.counters.camera
-    period = plan.period or (None if camera is None else camera.number("AcquirePeriod_RBV"))
-    exposures = {**plan.exposures, FrameKind.PROJECTION: seconds}
-    return replace(plan, exposures=exposures, period=period if period and math.isfinite(period) else None)
+    period = plan.period or (None if camera is None else seconds_of(camera.number("AcquirePeriod_RBV")))
+    exposures = {kind: each for kind, each in plan.exposures.items() if seconds_of(each)}
+    return replace(plan, exposures={**exposures, FrameKind.PROJECTION: seconds}, period=period)
 
 
 def _with_given(plan: RidePlan, given: Images, shape: tuple[int, int]) -> RidePlan:
