@@ -8,14 +8,17 @@ which pulse exposed which frame.
 from __future__ import annotations
 
 import asyncio
+import inspect
 import math
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 import numpy as np
+from bluesky.run_engine import RunEngine
 from ophyd_async.core import (
     DetectorAcquireLogic,
     DetectorDataLogic,
@@ -63,6 +66,8 @@ class _Frames(DetectorAcquireLogic):
         self._writer: NXtomoWriter | None = None
         self._task: asyncio.Task[None] | None = None
         self._lacking = range(0)  # triggers without a frame, of those asked for last
+        self.provider: _Rows | None = None
+        self.plan_ended = ""  # how, where it was not to its end
         self.kind, (self.rows, self._set_rows) = soft_signal_rw(ShownFrames), soft_signal_r_and_setter(int)
         self.settings, self.n, self._apart = CameraSettings(config.scan.exposure_s, TriggerSource.SOFTWARE), 1, 0.0
 
@@ -96,6 +101,14 @@ class _Frames(DetectorAcquireLogic):
         self._lacking = range(rows, rows + self.n)
         await asyncio.to_thread(self._arm, kind)
         self._task = asyncio.create_task(asyncio.to_thread(self._take, kind, loop))
+
+    async def pause(self) -> None:
+        """The plan repeats what it has asked for since its last checkpoint: the frame that is exposed is still written,
+        and no event refers to it."""
+        if self._task is not None and self.n == 1:
+            await asyncio.wait([self._task])
+        if self.provider is not None and self._writer is not None and self.n == 1:
+            self.provider.first = self._writer.rows
 
     async def wait_for_idle(self) -> None:
         """Until the last frame. Raises what ended them early."""
@@ -132,6 +145,11 @@ class _Frames(DetectorAcquireLogic):
                     status = "failed" if error is not None else "stopped"
                     why = f": {error}" if error is not None else ", as the plan ended before"
                     reason = f"{writer.rows} of {self._lacking.stop} frames were taken{why}."
+                elif self.plan_ended:
+                    status, reason = (
+                        "stopped",
+                        f"{writer.rows} frames were taken, and the plan ended: {self.plan_ended}.",
+                    )
                 writer.close(status, self._lacking, reason=reason)
 
     def _arm(self, kind: FrameKind) -> None:
@@ -201,11 +219,23 @@ class _Trigger(DetectorTriggerLogic):
         await self._frames.prepare(TriggerSource.EXTERNAL, num, livetime)
 
 
+class _Rows(StreamResourceDataProvider):
+    """The rows of the file for events, from `first` on: rows before it that no event has had belong to none."""
+
+    first = 0
+
+    async def make_stream_docs(self, collections_written: int, collections_per_event: int) -> AsyncIterator[Any]:
+        async for name, document in super().make_stream_docs(collections_written, collections_per_event):
+            if name == "stream_datum":
+                document["indices"]["start"] = max(document["indices"]["start"], self.first)
+            yield name, document
+
+
 class _File(DetectorDataLogic):
     def __init__(self, frames: _Frames) -> None:
         self._frames = frames
 
-    async def prepare_unbounded(self, datakey_name: str) -> StreamResourceDataProvider:
+    async def prepare_unbounded(self, datakey_name: str) -> _Rows:
         path, frame = await self._frames.new_file()
         resources = [
             StreamResourceInfo(
@@ -215,7 +245,38 @@ class _File(DetectorDataLogic):
             )
             for ending, column in COLUMNS.items()
         ]  # fmt: skip
-        return StreamResourceDataProvider(file_url(path), resources, "application/x-hdf5", self._frames.rows)
+        self._frames.provider = _Rows(file_url(path), resources, "application/x-hdf5", self._frames.rows)
+        return self._frames.provider
+
+
+def _caller() -> RunEngine | None:
+    """The RunEngine in whose task this runs: bluesky tells a device nothing of its plan."""
+    with suppress(RuntimeError):
+        task = asyncio.current_task()
+        owner = None if task is None else inspect.getcoroutinelocals(task.get_coro()).get("self")  # type: ignore[arg-type]
+        return owner if isinstance(owner, RunEngine) else None
+    return None
+
+
+class _Engine:
+    """Hears from a RunEngine how its plan ends; None: nobody tells."""
+
+    def __init__(self, engine: RunEngine | None) -> None:
+        self._engine, self._stop = engine, dict[str, Any]()
+        self._token = None if engine is None else engine.subscribe(self._hear, "stop")
+
+    def _hear(self, name: str, document: dict[str, Any]) -> None:
+        self._stop = document
+
+    def ending(self) -> str:
+        """How the plan ended, if not at its end; "" otherwise. To be asked in the task of the engine, once."""
+        if self._engine is None:
+            return ""
+        self._engine.unsubscribe(self._token)
+        exit_status = self._stop.get("exit_status", "success")
+        if self._engine.state != "running":  # stopping, aborting, halting
+            return f"the RunEngine is {self._engine.state}"
+        return "" if exit_status == "success" else f"{exit_status}, {self._stop.get('reason') or 'no reason given'}"
 
 
 class CameraDetector(StandardDetector):
@@ -230,10 +291,27 @@ class CameraDetector(StandardDetector):
         self, config: Config, instrument: ConnectedDevices, runs: Path | None = None, name: str = "camera"
     ) -> None:
         frames = _Frames(config, instrument, runs)
-        self._frames, self.kind = frames, frames.kind
+        self._frames, self.kind, self._engine = frames, frames.kind, _Engine(None)
         self.add_detector_logics(_Trigger(frames, instrument), frames, _File(frames))
         self.add_config_signals(self.kind)
         super().__init__(name)
+
+    def stage(self) -> Any:
+        """Begin; how the plan of the calling RunEngine ends is heard from now on."""
+        self._engine = _Engine(_caller())
+        return super().stage()
+
+    def unstage(self) -> Any:
+        """End, and close the file."""
+        self._frames.plan_ended = self._engine.ending()
+        return super().unstage()
+
+    async def pause(self) -> None:
+        """Called when the plan is paused, also by a suspender."""
+        await self._frames.pause()
+
+    async def resume(self) -> None:
+        """Do nothing: the plan triggers again."""
 
     async def _wait_for_index(self, *args: Any, **more: Any) -> AsyncIterator[Any]:
         try:
