@@ -10,8 +10,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 import math
-from collections.abc import AsyncIterator
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -67,7 +66,7 @@ class _Frames(DetectorAcquireLogic):
         self._task: asyncio.Task[None] | None = None
         self._lacking = range(0)  # triggers without a frame, of those asked for last
         self.provider: _Rows | None = None
-        self.plan_ended = ""  # how, where it was not to its end
+        self.ended_by: Callable[[], str] = lambda: "success"  # how the plan has ended
         self.kind, (self.rows, self._set_rows) = soft_signal_rw(ShownFrames), soft_signal_r_and_setter(int)
         self.settings, self.n, self._apart = CameraSettings(config.scan.exposure_s, TriggerSource.SOFTWARE), 1, 0.0
 
@@ -102,12 +101,10 @@ class _Frames(DetectorAcquireLogic):
         await asyncio.to_thread(self._arm, kind)
         self._task = asyncio.create_task(asyncio.to_thread(self._take, kind, loop))
 
-    async def pause(self) -> None:
-        """The plan repeats what it has asked for since its last checkpoint: the frame that is exposed is still written,
-        and no event refers to it."""
-        if self._task is not None and self.n == 1:
+    async def leave_out(self) -> None:
+        """Wait for the frame that was triggered alone; no event gets a row that none has had until now."""
+        if self._task is not None and self.provider is not None and self._writer is not None and self.n == 1:
             await asyncio.wait([self._task])
-        if self.provider is not None and self._writer is not None and self.n == 1:
             self.provider.first = self._writer.rows
 
     async def wait_for_idle(self) -> None:
@@ -145,11 +142,8 @@ class _Frames(DetectorAcquireLogic):
                     status = "failed" if error is not None else "stopped"
                     why = f": {error}" if error is not None else ", as the plan ended before"
                     reason = f"{writer.rows} of {self._lacking.stop} frames were taken{why}."
-                elif self.plan_ended:
-                    status, reason = (
-                        "stopped",
-                        f"{writer.rows} frames were taken, and the plan ended: {self.plan_ended}.",
-                    )
+                elif (ended_by := self.ended_by()) != "success":
+                    status, reason = "stopped", f"{writer.rows} frames were taken until the plan ended ({ended_by})."
                 writer.close(status, self._lacking, reason=reason)
 
     def _arm(self, kind: FrameKind) -> None:
@@ -249,36 +243,6 @@ class _File(DetectorDataLogic):
         return self._frames.provider
 
 
-def _caller() -> RunEngine | None:
-    """The RunEngine in whose task this runs: bluesky tells a device nothing of its plan."""
-    with suppress(RuntimeError):
-        task = asyncio.current_task()
-        owner = None if task is None else inspect.getcoroutinelocals(task.get_coro()).get("self")  # type: ignore[arg-type]
-        return owner if isinstance(owner, RunEngine) else None
-    return None
-
-
-class _Engine:
-    """Hears from a RunEngine how its plan ends; None: nobody tells."""
-
-    def __init__(self, engine: RunEngine | None) -> None:
-        self._engine, self._stop = engine, dict[str, Any]()
-        self._token = None if engine is None else engine.subscribe(self._hear, "stop")
-
-    def _hear(self, name: str, document: dict[str, Any]) -> None:
-        self._stop = document
-
-    def ending(self) -> str:
-        """How the plan ended, if not at its end; "" otherwise. To be asked in the task of the engine, once."""
-        if self._engine is None:
-            return ""
-        self._engine.unsubscribe(self._token)
-        exit_status = self._stop.get("exit_status", "success")
-        if self._engine.state != "running":  # stopping, aborting, halting
-            return f"the RunEngine is {self._engine.state}"
-        return "" if exit_status == "success" else f"{exit_status}, {self._stop.get('reason') or 'no reason given'}"
-
-
 class CameraDetector(StandardDetector):
     """The configured camera. `kind` is what the next frames show; the shutter is closed at the end.
 
@@ -291,24 +255,31 @@ class CameraDetector(StandardDetector):
         self, config: Config, instrument: ConnectedDevices, runs: Path | None = None, name: str = "camera"
     ) -> None:
         frames = _Frames(config, instrument, runs)
-        self._frames, self.kind, self._engine = frames, frames.kind, _Engine(None)
+        self._frames, self.kind = frames, frames.kind
         self.add_detector_logics(_Trigger(frames, instrument), frames, _File(frames))
         self.add_config_signals(self.kind)
         super().__init__(name)
 
     def stage(self) -> Any:
-        """Begin; how the plan of the calling RunEngine ends is heard from now on."""
-        self._engine = _Engine(_caller())
+        """Begin. bluesky tells no device how its plan ends: so it is heard from the RunEngine in whose task this is."""
+        task = asyncio.current_task()
+        engine = inspect.getcoroutinelocals(task.get_coro()).get("self") if task else None  # type: ignore[arg-type]
+        if isinstance(engine, RunEngine):
+            stops = list[Mapping[str, Any]]()
+            token = engine.subscribe(lambda name, stop: stops.append(stop), "stop")
+
+            def ended_by() -> str:
+                engine.unsubscribe(token)
+                told = stops[-1]["exit_status"] if stops else "success"
+                return str(told if engine.state == "running" else engine.state)
+
+            self._frames.ended_by = ended_by
         return super().stage()
 
-    def unstage(self) -> Any:
-        """End, and close the file."""
-        self._frames.plan_ended = self._engine.ending()
-        return super().unstage()
-
     async def pause(self) -> None:
-        """Called when the plan is paused, also by a suspender."""
-        await self._frames.pause()
+        """The plan, which pauses, repeats what it asked for since its last checkpoint: a frame that is exposed now is
+        still written, and no event refers to it."""
+        await self._frames.leave_out()
 
     async def resume(self) -> None:
         """Do nothing: the plan triggers again."""
