@@ -101,10 +101,9 @@ class _Frames(DetectorAcquireLogic):
         await asyncio.to_thread(self._arm, kind)
         self._task = asyncio.create_task(asyncio.to_thread(self._take, kind, loop))
 
-    async def leave_out(self) -> None:
-        """Wait for the frame that was triggered alone; no event gets a row that none has had until now."""
-        if self._task is not None and self.provider is not None and self._writer is not None and self.n == 1:
-            await asyncio.wait([self._task])
+    def leave_out(self) -> None:
+        """No event gets the rows that none has had until now."""
+        if self.provider is not None and self._writer is not None:
             self.provider.first = self._writer.rows
 
     async def wait_for_idle(self) -> None:
@@ -255,7 +254,7 @@ class CameraDetector(StandardDetector):
         self, config: Config, instrument: ConnectedDevices, runs: Path | None = None, name: str = "camera"
     ) -> None:
         frames = _Frames(config, instrument, runs)
-        self._frames, self.kind = frames, frames.kind
+        self._frames, self.kind, self._triggered = frames, frames.kind, None
         self.add_detector_logics(_Trigger(frames, instrument), frames, _File(frames))
         self.add_config_signals(self.kind)
         super().__init__(name)
@@ -276,10 +275,17 @@ class CameraDetector(StandardDetector):
             self._frames.ended_by = ended_by
         return super().stage()
 
+    def trigger(self) -> Any:
+        """Take one frame."""
+        self._triggered = super().trigger()
+        return self._triggered
+
     async def pause(self) -> None:
         """The plan, which pauses, repeats what it asked for since its last checkpoint: a frame that is exposed now is
         still written, and no event refers to it."""
-        await self._frames.leave_out()
+        if self._triggered is not None:
+            await asyncio.wait([self._triggered.task])
+            self._frames.leave_out()
 
     async def resume(self) -> None:
         """Do nothing: the plan triggers again."""
