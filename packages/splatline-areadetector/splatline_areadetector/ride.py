@@ -25,6 +25,10 @@ from splatline_areadetector.ridden import SLICE, EpochEndedError, Images, Ridden
 from splatline_areadetector.stream import FrameStream, Refused
 
 
+class NoScanError(ScanAborted):
+    """A stop while a scan was waited for."""
+
+
 def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
     """Record the next scan of the stream: in a run, or in one for each epoch of its frames' numbers.
 
@@ -59,7 +63,7 @@ def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
     """The first frame of a scan, which the stream still has; those before it are dropped.
 
     Raises:
-        ScanAborted: a stop was requested.
+        NoScanError: a stop was requested.
         ConfigError: the frames cannot be stored.
         InstrumentError: the server does not answer.
     """
@@ -85,7 +89,7 @@ def wait_for_scan(ride: Ride, first_id: int | None) -> ArrayFrame:
         if not told:
             told = True
             ride.say(outside_sentence(guide))
-    raise ScanAborted(f"Interrupted before the first frame: {ride.stop.reason}. Nothing was recorded.")
+    raise NoScanError(f"Interrupted before the first frame: {ride.stop.reason}. Nothing was recorded.")
 
 
 def _shown(ride: Ride) -> str:

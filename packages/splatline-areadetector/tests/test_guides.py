@@ -230,7 +230,7 @@ def test_a_file_is_read_anew_for_each_scan_and_rows_beyond_its_views_are_left(tm
     with h5py.File(path, "w") as file:  # while frames come, triggers that are nobody's
         file["INENC1.VAL.Value"] = np.arange(30.0) * 9
     assert math.degrees(guides[0].angle(_frame(1), 19)) == pytest.approx(171)
-    with pytest.raises(ConfigError, match="has 30 rows, and ride.angles.views is 20"):
+    with pytest.raises(ConfigError, match=r"has 30 rows, and ride\.angles\.views is 20"):
         guides[0].plan()
 
 
@@ -242,7 +242,7 @@ def test_a_missing_file_is_refused_with_the_first_projection(tmp_path: Path) -> 
     guide: Any = guide_of(config_of(tmp_path, "pva://P:I", given, darks={"count": 2}).ride)
     guide._wait = 0.2
     assert len(guide.plan().blocks) == 2
-    with pytest.raises(DataError, match="is not there: no projection has an angle. What came before is in the file"):
+    with pytest.raises(DataError, match=r"is not there: no projection has an angle\. What came before is in the file"):
         guide.angle(_frame(1), 0)
 
 

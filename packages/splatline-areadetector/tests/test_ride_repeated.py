@@ -1,0 +1,52 @@
+"""`beamline ride --repeat`: one scan after the other until Ctrl-C, also after one that lacks frames."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from fake_ioc import FakeIoc
+from ridden import PLAN, RideProgram, stored
+
+pytestmark = [
+    pytest.mark.usefixtures("loopback"),
+    pytest.mark.skipif(sys.platform == "win32", reason="no test sends Ctrl-C to one program alone there"),
+]
+WAITING = "Waiting for the first frame"
+
+
+@pytest.mark.parametrize(
+    ("scans", "in_the_midst", "code", "sentence"),
+    [
+        ([range(1, 21), range(21, 41)], False, 0, "Recorded: 2 scans, of which 0 lack frames."),
+        ([range(1, 21), [*range(21, 31), *range(32, 41)], range(41, 61)], False, 5,
+         "Recorded: 3 scans, of which 1 lacks frames. The last such: 1 of 20 projections are missing: 10"),
+        ([range(1, 21)], True, 4, "Recorded: 1 scan before this one, of which 0 lack frames."),
+    ],
+)  # fmt: skip
+def test_scan_after_scan_until_ctrl_c(
+    tmp_path: Path, scans: list[range], in_the_midst: bool, code: int, sentence: str
+) -> None:
+    with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", angles=PLAN) as ride:
+        for n, ids in enumerate(scans, 2):
+            ioc.send(ids)  # type: ignore[arg-type]
+            ride.wait_for(lambda n=n: ride.output.count(WAITING) >= n)  # type: ignore[misc]
+        if in_the_midst:
+            ioc.send(range(101, 106))
+            ride.wait_for(lambda: len(stored(tmp_path)) == len(scans) + 1)
+        ride.process.send_signal(signal.SIGINT)
+        assert ride.exit_code(60) == code, ride.output
+        assert sentence in " ".join(ride.output.split())
+    files = stored(tmp_path)
+    assert [file.ids.tolist() for file in files[: len(scans)]] == [[*ids] for ids in scans]
+    assert [file.status for file in files[: len(scans)]] == [
+        "complete" if len(ids) == 20 else "failed" for ids in scans
+    ]
+
+
+def test_ctrl_c_before_any_scan_says_that_nothing_was_recorded(tmp_path: Path) -> None:
+    with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", angles=PLAN) as ride:
+        ride.process.send_signal(signal.SIGINT)
+        assert ride.exit_code(60) == 130 and "Nothing was recorded." in ride.output
