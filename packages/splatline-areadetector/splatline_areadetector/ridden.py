@@ -285,7 +285,7 @@ class RiddenFrames:
                 if at and 0 < missing[0] == block.n - len(missing) and ended:
                     words.append(self._first_or_last(missing))
         for why, ids in self._unused.items():
-            words.append(f"Of {len(ids)} frames that came ({spans(ids)}), each: {why}.")
+            words.append(f"{count(len(ids), 'frame')} came ({spans(ids)}) that did not count: {why}.")
         if self._unused and self._guide.status:
             words.append(f"Now: {self._guide.status}.")
         words += losses_told(self._gaps, self._overflowed, self._ride.counters)

@@ -35,7 +35,7 @@ def test_scan_after_scan_until_ctrl_c(
             ride.wait_for(lambda n=n: ride.output.count(WAITING) >= n)  # type: ignore[misc]
         if in_the_midst:
             ioc.send(range(101, 106))
-            ride.wait_for(lambda: len(stored(tmp_path)) == len(scans) + 1)
+            ride.wait_for(lambda: len([*tmp_path.glob("runs/*/scan.h5")]) == len(scans) + 1)
         ride.process.send_signal(signal.SIGINT)
         assert ride.exit_code(60) == code, ride.output
         assert sentence in " ".join(ride.output.split())
