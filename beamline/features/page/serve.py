@@ -1,6 +1,6 @@
 """Server of a run, or of a folder of runs: on this machine alone by default, with new tokens at each start.
 
-The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`, to look alone.
+The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -163,8 +163,8 @@ class RunBrowser:
             opened.reader.close()
 
     def app(self, access: Access) -> Starlette:
-        """The application; its pages of runs are read-only."""
-        self._access = replace(access, act=None)
+        """The application; who may act may do so on the pages of its runs."""
+        self._access = access
         routes = [Route("/api/runs", self.table), Mount("/run/{number:number}", self.page_of)]
         return guarded("runs.html", routes, access)
 
@@ -196,7 +196,7 @@ class RunBrowser:
             for n in unused[: len(self._opened) + 1 - OPEN_RUNS]:
                 self._opened.pop(n).reader.close()
             reader = Reader(watched(runs[number]))
-            routes = page_routes(reader, self._access, lambda line: None)  # nobody may act from here
+            routes = page_routes(reader, self._access, lambda line: None)
             self._opened[number] = _Opened(reader, begins_with("index.html", routes))
         return self._opened[number]
 

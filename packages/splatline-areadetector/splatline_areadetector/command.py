@@ -40,7 +40,7 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
               help="Show what the IOC says, and whether two seconds of frames arrive whole.")  # fmt: skip
 @click.option("--darks", metavar="FILE", help="Darks, where the scan takes none: a scan, HDF5 (FILE::DATASET), TIFF.")
 @click.option("--flats", metavar="FILE", help="Flats, likewise.")
-@click.option("--page", is_flag=True, help="Show the run in the browser, as `beamline watch` does.")
+@click.option("--page", is_flag=True, help="Show the runs in the browser, at one address.")
 @click.option("--no-live", is_flag=True, help="Run without a live reconstruction.")
 @click.option(
     "--repeat", is_flag=True, help="After a scan, also one that lacks frames, wait for the next one, until Ctrl-C."
@@ -102,10 +102,11 @@ def _ride(
         held.enter_context(stop_signals(stop))
         terminal = held.enter_context(Terminal(sys.stderr))
         sinks: list[Sink] = [terminal, *others]
-        if page:
-            sinks.append(held.enter_context(PageBeside(terminal.say)))
-        stream, guide, counters = opened(config, held)
         runs = output or Path(config.storage.folder)
+        if page:  # of all its scans, at one address
+            runs.mkdir(parents=True, exist_ok=True)
+            held.enter_context(PageBeside(terminal.say)).serve("runs", str(runs), "--page")
+        stream, guide, counters = opened(config, held)
         now = Ride(config, stream, guide, counters, given, runs, stop, terminal.say)  # type: ignore[arg-type]
         while True:
             try:

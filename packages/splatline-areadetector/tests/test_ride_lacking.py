@@ -76,7 +76,9 @@ def test_frames_that_cannot_be_decoded_are_told_once(tmp_path: Path, whole: int)
         assert [file.ids.tolist() for file in stored(tmp_path)] == [[*range(1, whole + 1)]]
     assert isinstance(told.error, LedgerError)
     lost = f"{20 - whole} of 20 projections are missing"
-    assert lost in str(told.error) and f"{20 - whole} frames came ({whole + 1}-20) that did not count: " in str(told.error)
+    assert lost in str(told.error) and f"{20 - whole} frames came ({whole + 1}-20) that did not count: " in str(
+        told.error
+    )
     assert told.warnings.count("cannot be decoded") == 1
     (file,) = stored(tmp_path)
     assert len(file.ids) == whole

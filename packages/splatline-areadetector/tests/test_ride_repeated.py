@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import re
 import signal
 import sys
+import urllib.request
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_ioc import FakeIoc
@@ -50,3 +54,28 @@ def test_ctrl_c_before_any_scan_says_that_nothing_was_recorded(tmp_path: Path) -
     with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", angles=PLAN) as ride:
         ride.process.send_signal(signal.SIGINT)
         assert ride.exit_code(60) == 130 and "Nothing was recorded." in ride.output
+
+
+def test_the_page_of_all_scans_has_one_address_from_before_the_first(tmp_path: Path) -> None:
+    with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", "--page", angles=PLAN) as ride:
+        ride.wait_for(lambda: "Page, to control:" in ride.output)
+        (look,) = re.findall("Page, to watch: (http.*)", ride.output)
+        (act,) = re.findall("Page, to control: .*#act=(.*)", ride.output)
+        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        opener.open(look).close()  # its cookie is the token
+        base = look.partition("?")[0]
+
+        def runs() -> list[Any]:
+            with opener.open(f"{base}api/runs") as answer:
+                return list(json.load(answer)["rows"])
+
+        assert runs() == []
+        for n, ids in enumerate((range(1, 21), range(21, 41)), 1):
+            ioc.send(ids)
+            ride.wait_for(lambda n=n: ride.output.count(WAITING) > n)  # type: ignore[misc]
+            assert len(runs()) == n
+        with opener.open(f"{base}run/{runs()[0]['number']}/api/facts") as answer:
+            assert json.load(answer)["may_act"] and act
+        assert ride.output.count("Page, to watch") == 1
+        ride.process.send_signal(signal.SIGINT)
+        assert ride.exit_code(60) == 0

@@ -2,6 +2,7 @@
 const $ = (name) => document.querySelector(name);
 const PERIOD = 3000;  // ms
 let said = "";
+if (location.hash.startsWith("#act=")) { sessionStorage.setItem("act", location.hash.slice(5)); history.replaceState(null, "", location.pathname); }
 
 function row(cells, kind, link = null) {
   const made = document.createElement("tr");
