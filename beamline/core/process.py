@@ -150,6 +150,13 @@ class ChildProcess:
         with suppress(OSError, ValueError):  # it has ended
             os.write(self._process.stdin.fileno(), b".")
 
+    def become(self, line: str, on_line: Callable[[str], None], on_end: Callable[[], None]) -> None:
+        """Tell a tethered process a line, and pass its lines and its end to others from now on."""
+        self._on_line, self._on_end = on_line, on_end
+        assert self._process.stdin is not None
+        with suppress(OSError, ValueError):  # it has ended
+            os.write(self._process.stdin.fileno(), f"{line}\n".encode())
+
     def end(self, grace: float = 0.0) -> None:
         """Ask the process to end; kill it if it is still running after `grace` s of real time."""
         if self.running:

@@ -94,6 +94,7 @@ def _ride(
     repeat: bool,
     output: Path | None,
 ) -> list[RunResult]:
+    from beamline.scan.live_process import Standby
     from splatline_areadetector.ridden import Ride
     from splatline_areadetector.ride import NoScanError, opened, ride_scan
 
@@ -106,11 +107,15 @@ def _ride(
         if page:  # of all its scans, at one address
             runs.mkdir(parents=True, exist_ok=True)
             held.enter_context(PageBeside(terminal.say)).serve("runs", str(runs), "--page")
+        live = None
+        if config.recon.live and not no_live:
+            live = Standby()
+            held.callback(live.close)
         stream, guide, counters = opened(config, held)
         now = Ride(config, stream, guide, counters, given, runs, stop, terminal.say)  # type: ignore[arg-type]
         while True:
             try:
-                results.append(ride_scan(now, sinks, live=not no_live))
+                results.append(ride_scan(now, sinks, live=live))
             except LedgerError as error:
                 if not repeat:
                     raise

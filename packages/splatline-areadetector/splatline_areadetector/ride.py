@@ -13,6 +13,7 @@ from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.events import Sink
 from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted
+from beamline.scan.live_process import Standby
 from beamline.scan.run import record_scan
 from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
@@ -29,8 +30,11 @@ class NoScanError(ScanAborted):
     """A stop while a scan was waited for."""
 
 
-def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
+def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> RunResult:
     """Record the next scan of the stream: in a run, or in one for each epoch of its frames' numbers.
+
+    Args:
+        live: warms up while a scan is waited for, and makes its live volume; None: there is none.
 
     Raises:
         ConfigError: the frames cannot be stored, or no angles follow for them; nothing was recorded.
@@ -41,6 +45,8 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
     first_id = ride.config.ride.first_id
     while True:
         ride.guide.begin(first_id)
+        if live is not None:
+            live.prepare()
         first = wait_for_scan(ride, first_id)
         refuse_mistakes(ride.config, ride.counters, first)
         own = _with_exposure(ride.guide.plan(), ride, first)
@@ -48,9 +54,7 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
         ready = ready_of(ride.config, plan, first, ride.runs)
         source_of = partial(RiddenFrames, ride, own, first_id)
         try:
-            result = record_scan(
-                config, ready, source_of, ride.runs, sinks, ride.stop, live=live and ride.config.recon.live
-            )
+            result = record_scan(config, ready, source_of, ride.runs, sinks, ride.stop, live=live)
         except EpochEndedError as error:
             lost, first_id = error, None  # numbers of another epoch
             continue
