@@ -138,14 +138,14 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
 
 
 def _serve(folder: Path, port: int, bind: str, tethered: bool, browse: bool) -> None:
-    """tethered: of a program that runs meanwhile, to act as well."""
+    """tethered: of a program that records runs meanwhile, whose newest is shown, to act as well."""
     from beamline.features.page.serve import (
         RunBrowser,  # these load HDF5 and the server
         open_port,
         start,
     )
 
-    with closing(RunBrowser(folder)) as runs:
+    with closing(RunBrowser(folder, newest=tethered)) as runs:
         server = start(runs.app, open_port(bind, port), control=tethered)
         if tethered:
             at_end_of(sys.stdin.fileno(), lambda: _end(server))

@@ -24,7 +24,7 @@ import psutil
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -150,9 +150,14 @@ class _Opened:
 
 
 class RunBrowser:
-    """The runs of a folder, numbered: no name from a client reaches the file system."""
+    """The runs of a folder, numbered: no name from a client reaches the file system.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        newest: its address leads to the page of the newest run that has begun since, once one has.
+    """
+
+    def __init__(self, folder: Path, *, newest: bool = False) -> None:
+        self._before = set(runs_in(folder)) if newest else None
         self._folder, self._lock = folder, threading.Lock()
         self._access = Access(())
         self._numbers: dict[Path, int] = {}
@@ -166,7 +171,18 @@ class RunBrowser:
         """The application; who may act may do so on the pages of its runs."""
         self._access = access
         routes = [Route("/api/runs", self.table), Mount("/run/{number:number}", self.page_of)]
-        return guarded("runs.html", routes, access)
+        return guarded("runs.html" if self._before is None else self.newest, routes, access)
+
+    async def newest(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request as the page of the newest run does; the address itself leads there."""
+        since = [run for run in runs_in(self._folder) if run not in (self._before or ())]
+        if not since:
+            return await begins_with("runs.html", [])(scope, receive, send)
+        with self._lock:
+            number = self._numbers.setdefault(since[0], len(self._numbers))
+        if scope["path"] == "/":
+            return await RedirectResponse(f"/run/{number}/")(scope, receive, send)
+        return await self.page_of({**scope, "path_params": {"number": number}}, receive, send)
 
     def table(self, request: Request) -> Response:
         """Head and rows, newest first, each with the number of its page and the next step for the run."""

@@ -70,12 +70,18 @@ def test_the_page_of_all_scans_has_one_address_from_before_the_first(tmp_path: P
                 return list(json.load(answer)["rows"])
 
         assert runs() == []
+        with opener.open(base) as answer:
+            assert answer.url == base  # a table, while there is no run
         for n, ids in enumerate((range(1, 21), range(21, 41)), 1):
             ioc.send(ids)
             ride.wait_for(lambda n=n: ride.output.count(WAITING) > n)  # type: ignore[misc]
             assert len(runs()) == n
-        with opener.open(f"{base}run/{runs()[0]['number']}/api/facts") as answer:
-            assert json.load(answer)["may_act"] and act
+            newest = max((tmp_path / "runs").iterdir(), key=lambda run: run.stat().st_ctime)
+            with opener.open(base) as answer, opener.open(f"{answer.url}api/facts") as facts:
+                assert f"{base}run/" in answer.url and json.load(facts)["run"] == newest.name
+            with opener.open(f"{base}api/facts") as answer:
+                told = json.load(answer)
+                assert told["run"] == newest.name and told["may_act"] and act
         assert ride.output.count("Page, to watch") == 1
         ride.process.send_signal(signal.SIGINT)
         assert ride.exit_code(60) == 0

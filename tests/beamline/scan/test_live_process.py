@@ -174,8 +174,8 @@ def test_a_defect_of_the_run_leaves_no_live_reconstruction_behind(
     started: list[ChildProcess] = []
 
     class Kept(LiveReconstruction):
-        def __init__(self, *args: Any) -> None:
-            super().__init__(*args)
+        def __init__(self, *args: Any, **more: Any) -> None:
+            super().__init__(*args, **more)
             assert self._process is not None
             started.append(self._process)
 
