@@ -101,11 +101,6 @@ class _Frames(DetectorAcquireLogic):
         await asyncio.to_thread(self._arm, kind)
         self._task = asyncio.create_task(asyncio.to_thread(self._take, kind, loop))
 
-    def leave_out(self) -> None:
-        """No event gets the rows that none has had until now."""
-        if self.provider is not None and self._writer is not None:
-            self.provider.first = self._writer.rows
-
     async def wait_for_idle(self) -> None:
         """Until the last frame. Raises what ended them early."""
         if self._task is not None:
@@ -261,7 +256,7 @@ class CameraDetector(StandardDetector):
 
     def stage(self) -> Any:
         """Begin. bluesky tells no device how its plan ends: so it is heard from the RunEngine in whose task this is."""
-        task = asyncio.current_task()
+        self._triggered, task = None, asyncio.current_task()
         engine = inspect.getcoroutinelocals(task.get_coro()).get("self") if task else None  # type: ignore[arg-type]
         if isinstance(engine, RunEngine):
             stops = list[Mapping[str, Any]]()
@@ -284,8 +279,9 @@ class CameraDetector(StandardDetector):
         """The plan, which pauses, repeats what it asked for since its last checkpoint: a frame that is exposed now is
         still written, and no event refers to it."""
         if self._triggered is not None:
-            await asyncio.wait([self._triggered.task])
-            self._frames.leave_out()
+            await asyncio.wait([self._triggered.task])  # the first one makes the file
+            if self._frames.provider is not None:
+                self._frames.provider.first = await self.get_index()
 
     async def resume(self) -> None:
         """Do nothing: the plan triggers again."""

@@ -20,11 +20,9 @@ def main() -> None:
     from recon.warm_up import warm_up
 
     warm_up(R2(finish=0))
-    line = b""
-    while not line.endswith(b"\n"):  # unbuffered: whoever reads stdin next gets what follows
-        if not (letter := os.read(sys.stdin.fileno(), 1)):
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as told:  # whoever reads stdin next gets the rest
+        if not (line := told.readline()):
             return
-        line += letter
     log, *words = json.loads(line)
     os.dup2(os.open(log, os.O_WRONLY | os.O_APPEND), sys.stderr.fileno())
     sys.argv[1:] = words
