@@ -8,14 +8,16 @@ which pulse exposed which frame.
 from __future__ import annotations
 
 import asyncio
+import inspect
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 import numpy as np
+from bluesky.run_engine import RunEngine
 from ophyd_async.core import (
     DetectorAcquireLogic,
     DetectorDataLogic,
@@ -63,6 +65,8 @@ class _Frames(DetectorAcquireLogic):
         self._writer: NXtomoWriter | None = None
         self._task: asyncio.Task[None] | None = None
         self._lacking = range(0)  # triggers without a frame, of those asked for last
+        self.provider: _Rows | None = None
+        self.ended_by: Callable[[], str] = lambda: "success"  # how the plan has ended
         self.kind, (self.rows, self._set_rows) = soft_signal_rw(ShownFrames), soft_signal_r_and_setter(int)
         self.settings, self.n, self._apart = CameraSettings(config.scan.exposure_s, TriggerSource.SOFTWARE), 1, 0.0
 
@@ -132,6 +136,8 @@ class _Frames(DetectorAcquireLogic):
                     status = "failed" if error is not None else "stopped"
                     why = f": {error}" if error is not None else ", as the plan ended before"
                     reason = f"{writer.rows} of {self._lacking.stop} frames were taken{why}."
+                elif (ended_by := self.ended_by()) != "success":
+                    status, reason = "stopped", f"{writer.rows} frames were taken until the plan ended ({ended_by})."
                 writer.close(status, self._lacking, reason=reason)
 
     def _arm(self, kind: FrameKind) -> None:
@@ -201,11 +207,23 @@ class _Trigger(DetectorTriggerLogic):
         await self._frames.prepare(TriggerSource.EXTERNAL, num, livetime)
 
 
+class _Rows(StreamResourceDataProvider):
+    """The rows of the file for events, from `first` on: rows before it that no event has had belong to none."""
+
+    first = 0
+
+    async def make_stream_docs(self, collections_written: int, collections_per_event: int) -> AsyncIterator[Any]:
+        async for name, document in super().make_stream_docs(collections_written, collections_per_event):
+            if name == "stream_datum":
+                document["indices"]["start"] = max(document["indices"]["start"], self.first)
+            yield name, document
+
+
 class _File(DetectorDataLogic):
     def __init__(self, frames: _Frames) -> None:
         self._frames = frames
 
-    async def prepare_unbounded(self, datakey_name: str) -> StreamResourceDataProvider:
+    async def prepare_unbounded(self, datakey_name: str) -> _Rows:
         path, frame = await self._frames.new_file()
         resources = [
             StreamResourceInfo(
@@ -215,7 +233,8 @@ class _File(DetectorDataLogic):
             )
             for ending, column in COLUMNS.items()
         ]  # fmt: skip
-        return StreamResourceDataProvider(file_url(path), resources, "application/x-hdf5", self._frames.rows)
+        self._frames.provider = _Rows(file_url(path), resources, "application/x-hdf5", self._frames.rows)
+        return self._frames.provider
 
 
 class CameraDetector(StandardDetector):
@@ -230,10 +249,42 @@ class CameraDetector(StandardDetector):
         self, config: Config, instrument: ConnectedDevices, runs: Path | None = None, name: str = "camera"
     ) -> None:
         frames = _Frames(config, instrument, runs)
-        self._frames, self.kind = frames, frames.kind
+        self._frames, self.kind, self._triggered = frames, frames.kind, None
         self.add_detector_logics(_Trigger(frames, instrument), frames, _File(frames))
         self.add_config_signals(self.kind)
         super().__init__(name)
+
+    def stage(self) -> Any:
+        """Begin. bluesky tells no device how its plan ends: so it is heard from the RunEngine in whose task this is."""
+        self._triggered, task = None, asyncio.current_task()
+        engine = inspect.getcoroutinelocals(task.get_coro()).get("self") if task else None  # type: ignore[arg-type]
+        if isinstance(engine, RunEngine):
+            stops = list[Mapping[str, Any]]()
+            token = engine.subscribe(lambda name, stop: stops.append(stop), "stop")
+
+            def ended_by() -> str:
+                engine.unsubscribe(token)
+                told = stops[-1]["exit_status"] if stops else "success"
+                return str(told if engine.state == "running" else engine.state)
+
+            self._frames.ended_by = ended_by
+        return super().stage()
+
+    def trigger(self) -> Any:
+        """Take one frame."""
+        self._triggered = super().trigger()
+        return self._triggered
+
+    async def pause(self) -> None:
+        """The plan, which pauses, repeats what it asked for since its last checkpoint: a frame that is exposed now is
+        still written, and no event refers to it."""
+        if self._triggered is not None:
+            await asyncio.wait([self._triggered.task])  # the first one makes the file
+            if self._frames.provider is not None:
+                self._frames.provider.first = await self.get_index()
+
+    async def resume(self) -> None:
+        """Do nothing: the plan triggers again."""
 
     async def _wait_for_index(self, *args: Any, **more: Any) -> AsyncIterator[Any]:
         try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import threading
 import time
 from collections.abc import AsyncIterator, Generator, Iterator, Mapping
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from beamline.core.stop import StopRequest
 from beamline.instrument.connect import ConnectedDevices, connect
 from beamline.scan.control import Verb, ask, state_of
 from beamline.scan.run import run_scan
+from drivers.base.errors import DeviceError
 from drivers.base.protocols import RotationStage
 
 POLL = 0.2
@@ -161,15 +163,20 @@ class Rotation(Device):
     def __init__(self, stage: RotationStage, name: str = "rotation") -> None:
         super().__init__(name)
         self._stage, self._setpoint = stage, math.degrees(stage.position())
+        self._one_move, self._ended = threading.Lock(), threading.Event()
 
     @AsyncStatus.wrap
     async def set(self, value: float) -> None:
-        """Move to the angle and wait. Raises DeviceRefused beyond the limits, DeviceError if the stage stopped
-        short."""
-        self._setpoint = value
-        await asyncio.to_thread(self._move, math.radians(value))
+        """Move to the angle and wait, until it is there or `stop(success=True)`. Raises DeviceRefused beyond the
+        limits, DeviceError if the stage stopped short."""
+        self._setpoint, self._ended = value, (ended := threading.Event())
+        await asyncio.to_thread(self._move, math.radians(value), ended)
 
     async def stop(self, success: bool = True) -> None:
+        """Stop the stage. success: it was meant, as at each pause of a plan, which moves again afterwards: the move
+        ends without an error."""
+        if success:
+            self._ended.set()
         await asyncio.to_thread(self._stage.stop)
 
     async def locate(self) -> dict[str, float]:
@@ -188,11 +195,19 @@ class Rotation(Device):
     async def _degrees(self) -> float:
         return math.degrees(await asyncio.to_thread(self._stage.position))
 
-    def _move(self, angle: float) -> None:
+    def _move(self, angle: float, ended: threading.Event) -> None:
         stage, limits = self._stage, self._stage.limits
-        seconds = abs(angle - stage.position()) / limits.max_speed + limits.max_speed / limits.acceleration
-        stage.start_move(angle, limits.max_speed)
-        stage.wait(2 * seconds + MARGIN)
+        with self._one_move:  # the one that was stopped may not stand yet
+            seconds = abs(angle - stage.position()) / limits.max_speed + limits.max_speed / limits.acceleration
+            try:
+                if not ended.is_set():
+                    stage.start_move(angle, limits.max_speed)
+                if ended.is_set():  # by now
+                    stage.stop()
+                stage.wait(2 * seconds + MARGIN)
+            except DeviceError:
+                if not ended.is_set() or stage.moving():
+                    raise
 
 
 @contextmanager

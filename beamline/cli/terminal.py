@@ -304,10 +304,12 @@ class PageBeside:
         self._held.close()
 
     def __call__(self, event: Event) -> None:
-        if not isinstance(event, RunStarted):
-            return
-        page = ["watch", str(event.folder), "--control", "--until-stdin-ends"]
-        command = [sys.executable, "-m", "beamline.cli.main", *page]
+        if isinstance(event, RunStarted):
+            self.serve("watch", str(event.folder), "--control")
+
+    def serve(self, *page: str) -> None:
+        """Start the server of a page by its command."""
+        command = [sys.executable, "-m", "beamline.cli.main", *page, "--until-stdin-ends"]
         try:
             nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it
             child = ChildProcess(command, nowhere, self._pass_on, tether=True, behind=True)

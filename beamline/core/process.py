@@ -144,11 +144,16 @@ class ChildProcess:
         self.let_go()
         return ending
 
-    def beat(self) -> None:
-        """Write a byte to the stdin of a tethered process, as a sign of life."""
+    def tell(self, text: bytes = b".") -> None:
+        """Write to the stdin of a tethered process; a byte is a sign of life."""
         assert self._process.stdin is not None
         with suppress(OSError, ValueError):  # it has ended
-            os.write(self._process.stdin.fileno(), b".")
+            os.write(self._process.stdin.fileno(), text)
+
+    def become(self, line: str, on_line: Callable[[str], None], on_end: Callable[[], None]) -> None:
+        """Tell a tethered process a line, and pass its lines and its end to others from now on."""
+        self._on_line, self._on_end = on_line, on_end
+        self.tell(f"{line}\n".encode())
 
     def end(self, grace: float = 0.0) -> None:
         """Ask the process to end; kill it if it is still running after `grace` s of real time."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
+import os
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from beamline.config.load import Config, plan_of
 from beamline.core.event_lines import event_of
@@ -137,6 +140,7 @@ class LiveReconstruction:
         what: its name in messages.
         silence: s without output after which `finish` stops it.
         low_priority: a scan beside it takes precedence.
+        child: starts the process, as `Standby.start`.
 
     Attributes:
         ended: no law will come: it could not be started, or has ended in the scan and is not started again.
@@ -151,6 +155,7 @@ class LiveReconstruction:
         what: str = "live reconstruction",
         silence: float = _SILENCE,
         low_priority: bool = True,
+        child: Callable[..., ChildProcess] = ChildProcess,
     ) -> None:
         self._sink, self._log, self._on_law, self._what = sink, log, on_law, what
         self._silence, self.ended = silence, False
@@ -158,7 +163,7 @@ class LiveReconstruction:
         self._wanted = True  # nobody has asked it to end
         self._ready = threading.Event()
         self._process: ChildProcess | None = None
-        self._command, self._low_priority, self._again = command, low_priority, _AGAIN
+        self._command, self._low_priority, self._again, self._child = command, low_priority, _AGAIN, child
         self._changing = threading.Lock()  # of the process, and of whether another is wanted
         with self._changing:
             self._start("x")
@@ -166,7 +171,7 @@ class LiveReconstruction:
     def _start(self, mode: Literal["a", "x"]) -> None:
         try:
             with self._log.open(mode, encoding="utf-8") as stderr:
-                self._process = ChildProcess(
+                self._process = self._child(
                     self._command, stderr, self._pass_on, tether=True, on_end=self._on_end, behind=self._low_priority
                 )
         except OSError as error:
@@ -259,6 +264,36 @@ class LiveReconstruction:
             case Failed(message=message):
                 event = Warned(f"{self._what.capitalize()}: {message}")
         self._sink(replace(event, source="recon"))
+
+
+class Standby:
+    """A process that warms up for a live reconstruction before its scan begins, and becomes it, until `close`."""
+
+    def __init__(self) -> None:
+        self._process: ChildProcess | None = None
+
+    def prepare(self) -> None:
+        """Have one that waits, unless one does; a failure shows where it would be used."""
+        if self._process is None or not self._process.running:
+            words = [sys.executable, "-m", "beamline.cli.standby"]
+            with suppress(OSError), Path(os.devnull).open("w") as nowhere:
+                self._process = ChildProcess(words, nowhere, lambda line: None, tether=True, behind=True)
+
+    def start(
+        self, command: Sequence[str], stderr: TextIO, on_line: Callable[[str], None], *, on_end: Callable[[], None],
+        tether: bool, behind: bool,
+    ) -> ChildProcess:  # fmt: skip
+        """A process of a command of ours, as a `ChildProcess`: the one that waits, else another one."""
+        process, self._process = self._process, None
+        if process is None or not process.running:
+            return ChildProcess(command, stderr, on_line, tether=tether, on_end=on_end, behind=behind)
+        process.become(json.dumps([stderr.name, *command[3:]]), on_line, on_end)
+        return process
+
+    def close(self) -> None:
+        """End one that waits."""
+        if self._process is not None:
+            self._process.end()
 
 
 def reconstruct(command: Sequence[str], log: Path, sink: Sink, stop: StopRequest) -> Mapping[str, Any] | None:

@@ -15,6 +15,7 @@ from beamline.config.monitor import policies
 from beamline.core.errors import ReferencesError, ScanStopped, user_message
 from beamline.core.events import ScanDone, Sink, StateEntered, Warned
 from beamline.core.files import RECON_LOG, SCAN
+from beamline.core.process import ChildProcess
 from beamline.core.run_result import RunResult
 from beamline.core.stop import PauseRequest, StopRequest
 from beamline.core.text import count
@@ -71,6 +72,7 @@ class Measurement:
         began: when the run did, on the monotonic clock.
         series: the run that goes on, if one does.
         source_of: makes what delivers the frames where others control the scan; None: we do, with the devices.
+        child: starts the live reconstruction.
     """
 
     config: Config
@@ -82,6 +84,7 @@ class Measurement:
     began: float
     series: ResumableRun | None
     source_of: Callable[[Measurement], FrameSource] | None = None
+    child: Callable[..., ChildProcess] = ChildProcess
     pause: PauseRequest = field(default_factory=PauseRequest)
 
     @cached_property
@@ -141,7 +144,7 @@ class Measurement:
             follower = None
             if command is not None:
                 log, on_law = self.folder / RECON_LOG, self.decider.add_law
-                follower = LiveReconstruction(command, log, self.sink, on_law)
+                follower = LiveReconstruction(command, log, self.sink, on_law, child=self.child)
                 ending.callback(follower.close)
             return self._acquire_and_follow(writer, follower, release)
 

@@ -23,13 +23,14 @@ from beamline.core.errors import (
 from beamline.core.events import Failed, RunDone, RunStarted, Sink, StateEntered, Warned
 from beamline.core.files import CONFIG, EVENTS, RECON, RECON_LOG, REPORT, SCAN, USER_LOG, create_run_folder, new_log
 from beamline.core.machine import free_memory
+from beamline.core.process import ChildProcess
 from beamline.core.run_result import RunResult
 from beamline.core.sinks import Announcer, JsonLines, UserLog, fan_out
 from beamline.core.stop import ScanAborted, StopRequest
 from beamline.instrument.connect import ConnectedDevices, clock_after, connect
 from beamline.scan.control import NEXT, State, StateMachine, verbs_taken
 from beamline.scan.live_plan import live_plan
-from beamline.scan.live_process import LiveCommand, follow_command, reconstruct
+from beamline.scan.live_process import LiveCommand, Standby, follow_command, reconstruct
 from beamline.scan.measurement import FrameSource, Measurement
 from beamline.scan.preflight import ReadyScan, all_of, preflight
 from beamline.scan.resume import ResumableRun
@@ -118,7 +119,7 @@ def record_scan(
     sinks: Sequence[Sink],
     stop: StopRequest,
     *,
-    live: bool,
+    live: Standby | None,
 ) -> RunResult:
     """Record a scan that others control, in a run folder of its own, as `run_scan` does one of ours.
 
@@ -128,7 +129,7 @@ def record_scan(
         config: its sections sample, storage, monitor, references, recon, scan and devices.beam_monitor count.
         source_of: makes what delivers the frames, from the measurement that takes them.
         runs: the folder in which the run gets its own.
-        live: with a live reconstruction.
+        live: starts a live reconstruction; None: there is none.
 
     Raises:
         LedgerError: frames are missing. ScanStopped, ScanAborted: it was requested. DataError: the disk failed.
@@ -138,7 +139,8 @@ def record_scan(
     with ExitStack() as stack:
         folder = create_run_folder(runs, config.sample.name, others.clock.now())
         sink = _announcing(config, ready, folder, others.clock, sinks, stack)
-        measurement = Measurement(config, others, ready, folder, stop, sink, began, None, source_of)
+        child = ChildProcess if live is None else live.start
+        measurement = Measurement(config, others, ready, folder, stop, sink, began, None, source_of, child=child)
         stack.enter_context(verbs_taken(folder, stop, measurement.pause))
         views = live_plan(ready.timing.shape, ready.plan.angles.size, free_memory())
         return _to_its_end(measurement, follow_command(config, views) if live else None, None, lambda: None)

@@ -98,7 +98,7 @@ class _Keeper:
         """Wait until the first one is ready, and keep it from then on."""
         deadline = time.monotonic() + READY_WITHIN
         while not self._ready.wait(BETWEEN) and self._process.running and time.monotonic() < deadline:
-            self._process.beat()
+            self._process.tell()
         if not self._ready.is_set() or not self._process.running:
             self._sink(Warned("The watchdog is not running: if the scan is killed, the shutter stays open."))
         self._thread = threading.Thread(target=self._keep, args=(stop, pause), name="watchdog", daemon=True)
@@ -114,7 +114,7 @@ class _Keeper:
         left = AGAIN
         while not self._over.wait(BEAT):
             if self._process.running:
-                self._process.beat()
+                self._process.tell()
                 continue
             code = self._process.code
             if code == ACTED:

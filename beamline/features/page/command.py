@@ -105,8 +105,9 @@ def _end(server: PageServer) -> None:
 @click.option("--page", "as_page", is_flag=True, help="Show the runs in the browser; a link opens the page of each.")
 @port_option
 @bind_option
+@click.option("--until-stdin-ends", "tethered", is_flag=True, hidden=True)
 @click.option("--open", "browse", is_flag=True, help="With --page: open it in this machine's browser.")
-def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str, browse: bool) -> None:
+def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str, tethered: bool, browse: bool) -> None:
     """List the runs in FOLDER (./runs), newest first: sample, frames, state, size on the disk, flags.
 
     A run that was resumed is one line. A run that is not complete shows the frames in its files and the frames planned.
@@ -122,7 +123,7 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
     if as_page:
         if as_json:
             raise click.UsageError("--page does not go with --json.")
-        _serve(folder, port, bind, browse)
+        _serve(folder, port, bind, tethered, browse)
         return
     with answering(as_json) as answer:
         runs = [describe(run) for run in runs_in(folder)]
@@ -136,15 +137,19 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
             click.echo(f"{run.folder.name}: {sentence}", err=True)
 
 
-def _serve(folder: Path, port: int, bind: str, browse: bool) -> None:
+def _serve(folder: Path, port: int, bind: str, tethered: bool, browse: bool) -> None:
+    """tethered: of a program that records runs meanwhile, whose newest is shown, to act as well."""
     from beamline.features.page.serve import (
         RunBrowser,  # these load HDF5 and the server
         open_port,
         start,
     )
 
-    with closing(RunBrowser(folder)) as runs:
-        serve_shown(start(runs.app, open_port(bind, port)), browse)
+    with closing(RunBrowser(folder, newest=tethered)) as runs:
+        server = start(runs.app, open_port(bind, port), control=tethered)
+        if tethered:
+            at_end_of(sys.stdin.fileno(), lambda: _end(server))
+        serve_shown(server, browse)
 
 
 @click.command(

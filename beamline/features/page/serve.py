@@ -1,6 +1,6 @@
 """Server of a run, or of a folder of runs: on this machine alone by default, with new tokens at each start.
 
-The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`, to look alone.
+The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -24,7 +24,7 @@ import psutil
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -150,9 +150,14 @@ class _Opened:
 
 
 class RunBrowser:
-    """The runs of a folder, numbered: no name from a client reaches the file system."""
+    """The runs of a folder, numbered: no name from a client reaches the file system.
 
-    def __init__(self, folder: Path) -> None:
+    Args:
+        newest: its address leads to the page of the newest run that has begun since, once one has.
+    """
+
+    def __init__(self, folder: Path, *, newest: bool = False) -> None:
+        self._before = set(runs_in(folder)) if newest else None
         self._folder, self._lock = folder, threading.Lock()
         self._access = Access(())
         self._numbers: dict[Path, int] = {}
@@ -163,10 +168,21 @@ class RunBrowser:
             opened.reader.close()
 
     def app(self, access: Access) -> Starlette:
-        """The application; its pages of runs are read-only."""
-        self._access = replace(access, act=None)
+        """The application; who may act may do so on the pages of its runs."""
+        self._access = access
         routes = [Route("/api/runs", self.table), Mount("/run/{number:number}", self.page_of)]
-        return guarded("runs.html", routes, access)
+        return guarded("runs.html" if self._before is None else self.newest, routes, access)
+
+    async def newest(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request as the page of the newest run does; the address itself leads there."""
+        since = [run for run in runs_in(self._folder) if run not in (self._before or ())]
+        if not since:
+            return await begins_with("runs.html", [])(scope, receive, send)
+        with self._lock:
+            number = self._numbers.setdefault(since[0], len(self._numbers))
+        if scope["path"] == "/":
+            return await RedirectResponse(f"/run/{number}/")(scope, receive, send)
+        return await self.page_of({**scope, "path_params": {"number": number}}, receive, send)
 
     def table(self, request: Request) -> Response:
         """Head and rows, newest first, each with the number of its page and the next step for the run."""
@@ -196,7 +212,7 @@ class RunBrowser:
             for n in unused[: len(self._opened) + 1 - OPEN_RUNS]:
                 self._opened.pop(n).reader.close()
             reader = Reader(watched(runs[number]))
-            routes = page_routes(reader, self._access, lambda line: None)  # nobody may act from here
+            routes = page_routes(reader, self._access, lambda line: None)
             self._opened[number] = _Opened(reader, begins_with("index.html", routes))
         return self._opened[number]
 

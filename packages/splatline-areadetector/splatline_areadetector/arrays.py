@@ -111,8 +111,7 @@ def array_frame(value: Any, received: float, is_current: bool = False) -> ArrayF
     _refuse_type(dtype, codec, element)
     stamp = value.timeStamp
     window = _window(value.dimension)
-    if not codec and pixels.size != math.prod(window.shape):
-        raise FrameRefusedError(f"it has {pixels.size} pixels, and its dimensions say {window.shape}")
+    _refuse_size(window.shape, dtype, codec, pixels)
     return ArrayFrame(
         pixels,
         dtype,
@@ -145,6 +144,15 @@ def _refuse_type(dtype: np.dtype[Any], codec: str, element: str) -> None:
         )
 
 
+def _refuse_size(shape: tuple[int, int], dtype: np.dtype[Any], codec: str, pixels: NDArray[Any]) -> None:
+    n_bytes = dtype.itemsize * math.prod(shape)
+    if not 0 < n_bytes <= MOST_BYTES or not (codec or pixels.nbytes == n_bytes):
+        raise FrameRefusedError(
+            f"it has {pixels.nbytes} bytes, and its dimensions say {shape[0]} x {shape[1]} {dtype}; expected as many, "
+            f"and {MOST_BYTES >> 20} MB at most"
+        )
+
+
 def _window(dimension: Any) -> Window:
     """dimension[0] is x, the fastest."""
     x, y = dimension
@@ -159,6 +167,8 @@ def _window(dimension: Any) -> Window:
 ELEMENTS = {1: "i1", 2: "i2", 3: "i4", 4: "i8", 5: "u1", 6: "u2", 7: "u4", 8: "u8", 9: "f4", 10: "f8"}
 """`codec.parameters` of NTNDArray: pvData's number of the pixels' type, for numpy."""
 _BLOCK = 8192  # bytes of a block of bitshuffle
+MOST_BYTES = 2**29  # of a frame: more than those of the largest sensors
+_MOST_RATIO = 256  # LZ4 makes 255 bytes of one at most
 
 
 def _bslz4(payload: bytes, n_bytes: int, item: int) -> bytes:
@@ -182,17 +192,20 @@ def decoded(codec: str, payload: NDArray[np.uint8], shape: tuple[int, int], dtyp
         codec: one of NAMES.
 
     Raises:
-        ValueError: they cannot be decoded.
+        ValueError: they cannot be decoded. What they cannot hold is found before memory is taken for it.
     """
     make_filter, with_header = _CODECS[codec]
     n_bytes = dtype.itemsize * shape[0] * shape[1]
+    held = int.from_bytes(payload[4:8].tobytes(), "little") if codec == "blosc" else _MOST_RATIO * payload.nbytes
+    if held < n_bytes:
+        raise ValueError(f"its {codec} pixels cannot be decoded (they are fewer than {shape[0]} x {shape[1]})")
     chunk = payload.tobytes()
     if not chunk.startswith(struct.pack(">Q", n_bytes)):  # pvapy's simulator sends chunks of files as they are
         chunk = with_header(chunk, n_bytes, dtype.itemsize)
     try:
         with h5py.File("frame", "w", driver="core", backing_store=False) as file:
-            held = file.create_dataset("frame", shape, dtype.newbyteorder("<"), chunks=shape, **make_filter())
-            held.id.write_direct_chunk((0, 0), chunk)
-            return held[()].astype(dtype, copy=False)
+            frame = file.create_dataset("frame", shape, dtype.newbyteorder("<"), chunks=shape, **make_filter())
+            frame.id.write_direct_chunk((0, 0), chunk)
+            return frame[()].astype(dtype, copy=False)
     except (OSError, RuntimeError) as error:
         raise ValueError(f"its {codec} pixels cannot be decoded ({error})") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,12 +12,14 @@ import click
 
 from beamline.cli.options import json_events, json_option, set_option
 from beamline.cli.terminal import PageBeside, Terminal
-from beamline.core.errors import AlarmError
+from beamline.core.errors import AlarmError, BeamlineError
+from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest, stop_signals
+from beamline.core.text import count
+from beamline.scan.ledger import LedgerError
 
 if TYPE_CHECKING:
     from beamline.core.events import Sink
-    from beamline.core.run_result import RunResult
     from splatline_areadetector.config import RideConfig
 
 
@@ -37,9 +40,11 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
               help="Show what the IOC says, and whether two seconds of frames arrive whole.")  # fmt: skip
 @click.option("--darks", metavar="FILE", help="Darks, where the scan takes none: a scan, HDF5 (FILE::DATASET), TIFF.")
 @click.option("--flats", metavar="FILE", help="Flats, likewise.")
-@click.option("--page", is_flag=True, help="Show the run in the browser, as `beamline watch` does.")
+@click.option("--page", is_flag=True, help="Show the runs in the browser, at one address.")
 @click.option("--no-live", is_flag=True, help="Run without a live reconstruction.")
-@click.option("--repeat", is_flag=True, help="After a scan, wait for the next one, until Ctrl-C.")
+@click.option(
+    "--repeat", is_flag=True, help="After a scan, also one that lacks frames, wait for the next one, until Ctrl-C."
+)
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False),
               help="Folder for the folders of runs. Default: storage.folder of CONFIG.")  # fmt: skip
 @json_option
@@ -89,23 +94,58 @@ def _ride(
     repeat: bool,
     output: Path | None,
 ) -> list[RunResult]:
+    from beamline.scan.live_process import Standby
     from splatline_areadetector.ridden import Ride
-    from splatline_areadetector.ride import opened, ride_scan
+    from splatline_areadetector.ride import NoScanError, opened, ride_scan
 
-    stop, results = StopRequest(), []
+    stop, results, lacking = StopRequest(), list[RunResult](), list[LedgerError]()
     with ExitStack() as held:
         held.enter_context(stop_signals(stop))
         terminal = held.enter_context(Terminal(sys.stderr))
         sinks: list[Sink] = [terminal, *others]
-        if page:
-            sinks.append(held.enter_context(PageBeside(terminal.say)))
-        stream, guide, counters = opened(config, held)
         runs = output or Path(config.storage.folder)
+        if page:  # of all its scans, at one address
+            runs.mkdir(parents=True, exist_ok=True)
+            held.enter_context(PageBeside(terminal.say)).serve("runs", str(runs), "--page")
+        live = None
+        if config.recon.live and not no_live:
+            live = Standby()
+            held.callback(live.close)
+        stream, guide, counters = opened(config, held)
         now = Ride(config, stream, guide, counters, given, runs, stop, terminal.say)  # type: ignore[arg-type]
         while True:
-            results.append(ride_scan(now, sinks, live=not no_live))
-            if not repeat or stop.stopping:
+            try:
+                results.append(ride_scan(now, sinks, live=live))
+            except LedgerError as error:
+                if not repeat:
+                    raise
+                lacking.append(error)
+                terminal.say(str(error))
+            except BeamlineError as error:
+                if not (results or lacking):
+                    raise
+                _raise_worst("" if isinstance(error, NoScanError) else error, len(results), lacking, terminal.say)
                 return results
+            if not repeat:
+                return results
+
+
+def _raise_worst(
+    ended: BeamlineError | str, n_whole: int, lacking: Sequence[LedgerError], say: Callable[[str], None]
+) -> None:
+    """Say how many scans were recorded one after the other, and raise what was worst.
+
+    Args:
+        ended: why the last one did; "": it was waited for.
+    """
+    n = n_whole + len(lacking)
+    told = f"{count(n, 'scan')} before this one" if ended else count(n, "scan")
+    told = f"Recorded: {told}, of which {len(lacking)} {'lacks' if len(lacking) == 1 else 'lack'} frames."
+    if lacking:
+        raise LedgerError(" ".join(filter(None, (str(ended), told, "The last such:", str(lacking[-1])))), [])
+    if isinstance(ended, BeamlineError):
+        raise type(ended)(f"{ended} {told}") from ended
+    say(told)
 
 
 def _lines(result: RunResult) -> str:

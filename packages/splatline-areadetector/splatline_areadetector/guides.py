@@ -9,12 +9,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Protocol
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.errors import ConfigError, DataError
+from beamline.core.text import count
 from beamline.plan.plan import Place
-from beamline.storage.hdf5 import open_hdf5
+from beamline.storage.hdf5 import open_hdf5, readable
 from drivers.base.frame import FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import (
@@ -39,6 +41,8 @@ EXPOSURE = "AcquireTime"
 _VIEWS = FrameKind.PROJECTION
 _BEFORE, _AFTER = (Place.START, Place.BOTH), (Place.END, Place.BOTH)
 _POLL = 0.1  # s between two looks at a file that grows
+MOST, MOST_DEGREES = 1_000_000, 1e6  # frames of a kind, and degrees, as a configuration may have
+_FEW, _NEAR = 3, 0.02  # rows that tell a step, and how near that of a half or whole turn in radians must be
 SKEW = 0.5  # s by which the clocks of two IOCs may differ and still count as set alike
 
 
@@ -86,8 +90,13 @@ def _lacking(key: str, name: str, frame: ArrayFrame) -> str:
     return (
         f"ride.{key} is {name}, an attribute that the frames do not have; they have "
         f"{', '.join(frame.attributes) or 'none'}. Add it to the camera's NDAttributesFile, or change ride.{key}. "
-        "Nothing was recorded."
+        "What came before, if anything, is in the file."
     )
+
+
+def seconds_of(told: Any) -> float | None:
+    """s that an attribute or a variable tells; None where it is no time."""
+    return float(told) if isinstance(told, int | float) and 0 < told <= MOST else None
 
 
 def kind_of(word: Any) -> FrameKind | None:
@@ -145,18 +154,25 @@ class AttributeGuide(_ByNumbers):
 
     def __init__(self, ride: RideSection, angles: AttributeAngles) -> None:
         super().__init__(ride, np.full(angles.views, np.nan))
-        self._name = angles.name
+        self._name, self._seen = angles.name, False
 
     def phase(self, frame: ArrayFrame) -> Phase:
-        if self._name not in frame.attributes:
+        phase = super().phase(frame)
+        self._seen = self._seen or self._name in frame.attributes
+        if phase.kind is _VIEWS and not self._seen:
             raise ConfigError(_lacking("angles.name", self._name, frame))
-        return super().phase(frame)
+        return phase
 
     def angle(self, frame: ArrayFrame, trigger: int) -> float:
         try:
-            return math.radians(float(frame.attributes[self._name]))
+            return _angle(float(frame.attributes[self._name]))
         except (KeyError, TypeError, ValueError):
             return math.nan
+
+
+def _angle(degrees: float) -> float:
+    """Radians; NaN of what is no position of a stage."""
+    return math.radians(degrees) if abs(degrees) <= MOST_DEGREES else math.nan
 
 
 class PandaGuide(_ByNumbers):
@@ -164,33 +180,109 @@ class PandaGuide(_ByNumbers):
 
     Args:
         wait: s for a row that the file does not have yet.
+
+    Raises:
+        ConfigError: the file is there, and its rows are no angles in degrees, one a view at most.
     """
 
     told_by = "panda"
 
     def __init__(self, ride: RideSection, angles: PandaAngles, wait: float = 2.0) -> None:
         super().__init__(ride, np.full(angles.views, np.nan))
-        self._settings, self._wait, self._rows = angles, wait, np.empty(0)
+        self._settings, self._wait, self._path = angles, wait, Path(angles.file)
+        self._rows, self._waited_at = np.empty(0), -1  # rows at which it was waited for another one in vain
+        if (problem := self._look()) and self._path.exists():
+            raise ConfigError(f"{problem}. Nothing was started.")
+
+    @property
+    def status(self) -> str:  # type: ignore[override]
+        """What the file has, by which an operator sees whether it is that of this scan."""
+        if not self._rows.size:
+            return f"{self._path} {'has no rows' if self._path.exists() else 'is not there'} yet"
+        ends = " to ".join(f"{math.degrees(self._radians(i)):.6g}°" for i in (0, -1))
+        return (
+            f"{self._path} has {count(self._rows.size, 'row')}, {ends}, which are this scan's unless it is written anew"
+        )
+
+    def plan(self) -> RidePlan:
+        self._rows, self._waited_at, deadline = np.empty(0), -1, time.monotonic() + self._wait
+        while (problem := self._look()) and time.monotonic() < deadline:
+            time.sleep(_POLL)
+        begins = self._blocks[0].kind is _VIEWS and self._ride.kinds is None  # else it may come after the references
+        if problem and (begins or self._path.exists()):
+            raise ConfigError(f"{problem}. Nothing was recorded.")
+        return super().plan()
 
     def angle(self, frame: ArrayFrame, trigger: int) -> float:
         deadline = time.monotonic() + self._wait
         while trigger >= self._rows.size:
-            self._refresh()
-            if time.monotonic() > deadline:
+            problem = self._look()
+            if trigger >= (n := self._rows.size) and (n == self._waited_at or time.monotonic() > deadline):
+                self._waited_at = n
+                if problem and not n:
+                    raise DataError(f"{problem}: no projection has an angle. What came before is in the file.")
                 return math.nan
-            if trigger >= self._rows.size:
+            if trigger >= n:
                 time.sleep(_POLL)
-        settings = self._settings
-        return math.radians(settings.offset_deg + settings.deg_per_unit * float(self._rows[trigger]))
+        return self._radians(trigger)
 
-    def _refresh(self) -> None:
-        path, name = Path(self._settings.file), self._settings.dataset
-        if not path.exists():
-            return
-        with closing(open_hdf5(path)) as file:
-            if name not in file:
-                raise DataError(f"{path} has no {name}; ride.angles.dataset names the position at each trigger.")
-            self._rows = np.asarray(file[name][()], np.float64)
+    def _radians(self, row: int) -> float:
+        return _angle(self._settings.offset_deg + self._settings.deg_per_unit * float(self._rows[row]))
+
+    def _look(self) -> str:
+        """Read the rows that the file has now. What is wrong with it, without a full stop; "" if nothing is."""
+        name, views = self._settings.dataset, self._settings.views
+        if not self._path.exists():
+            return f"{self._path} (ride.angles.file) is not there"
+        try:
+            with closing(open_hdf5(self._path)) as file, readable(self._path):
+                rows = file.get(name)
+                problem, n = _panda_problem(rows), getattr(rows, "size", 0) or 0
+                if not problem:
+                    self._rows = np.asarray(rows[:views], np.float64)
+                    problem = _unit_problem(self._rows, self._settings)
+        except DataError as error:
+            return str(error).removesuffix(".")
+        if n > views and not problem:
+            problem = (
+                f"has {n} rows, and ride.angles.views is {views}: move the file of another scan away, or set views"
+            )
+        return problem and f"{self._path}: {name} {problem}"
+
+
+def _panda_problem(rows: Any) -> str:
+    """Why what a file has by a name cannot be the positions at triggers, as a sentence's end; "" if it can."""
+    if not isinstance(rows, h5py.Dataset):
+        what = "is not there" if rows is None else "is a group"
+    elif rows.dtype.kind not in "iuf":
+        what = f"holds {'text' if rows.dtype.kind in 'SO' else rows.dtype}, not numbers"
+    elif rows.ndim != 1:
+        what = f"has the shape {rows.shape}, not a number a trigger"
+    else:
+        return ""
+    return f"{what}; set ride.angles.dataset to the positions, such as {PandaAngles.model_fields['dataset'].default}"
+
+
+def _unit_problem(rows: NDArray[np.float64], settings: PandaAngles) -> str:
+    """Why rows are no degrees, as a sentence's end; "" if they can be, or the configuration says what their unit is."""
+    known = rows[np.isfinite(rows)]
+    if rows.size < _FEW or "deg_per_unit" in settings.model_fields_set:
+        return ""
+    step = 0.0 if known.size < _FEW else float(np.median(np.abs(np.diff(known))))
+    if not step:
+        whole = rows.size == settings.views
+        return f"has {known.size} positions in {rows.size} rows, and they do not change" if whole else ""
+    spans = step * np.array([[settings.views], [settings.views - 1]])
+    if (np.abs(spans / (math.pi * np.array([1, 2])) - 1) < _NEAR).any():
+        return (
+            f"has steps of {step:.4g}, as of radians; set ride.angles.deg_per_unit to {math.degrees(1):.7g} (or to 1)"
+        )
+    if step > 180 or (spans[0] > 400 and not (known % 1).any()):
+        return (
+            f"has steps of {step:.6g}, as of encoder counts; set ride.angles.deg_per_unit to 360 / counts per turn "
+            "(or, if they are degrees, to 1)"
+        )
+    return ""
 
 
 _NEEDED = ("RotationStart", "RotationStep", "NumAngles", "ScanStatus")
@@ -228,17 +320,20 @@ class TomoscanGuide:
 
     def plan(self) -> RidePlan:
         number, text = self._variables.number, self._variables.text
-        views = int(number("NumAngles") or 0)
-        start, step = number("RotationStart") or 0.0, number("RotationStep") or 0.0
-        if views < 1 or (views > 1 and step == 0.0):
+        views, start, step = (number(name) or 0.0 for name in ("NumAngles", "RotationStart", "RotationStep"))
+        darks, flats = (number(f"Num{name}Fields") or 0.0 for name in ("Dark", "Flat"))
+        numbers = all(abs(angle) <= MOST_DEGREES for angle in (start, step))
+        numbers = numbers and all(0 <= n <= MOST for n in (darks, flats, views))
+        if not numbers or views < 1 or (views > 1 and step == 0.0):
             raise ConfigError(
-                f"{self._prefix}NumAngles is {views}, RotationStep {step:g}: no angles follow from them. Set them in "
-                "tomoscan before its scan begins. Nothing was recorded."
+                f"{self._prefix}NumAngles is {views:g}, RotationStep {step:g}: no angles follow from them, with "
+                f"RotationStart {start:g}, NumDarkFields {darks:g} and NumFlatFields {flats:g}. Set them in tomoscan "
+                "before its scan begins. Nothing was recorded."
             )
-        self._angles = np.radians(start + step * np.arange(views, dtype=np.float64))
+        self._angles = np.radians(start + step * np.arange(int(views), dtype=np.float64))
         counts = {
-            kind: (int(number(f"Num{name}Fields") or 0), text(f"{name}FieldMode"))
-            for kind, name in ((FrameKind.DARK, "Dark"), (FrameKind.FLAT, "Flat"))
+            FrameKind.DARK: (int(darks), text("DarkFieldMode")),
+            FrameKind.FLAT: (int(flats), text("FlatFieldMode")),
         }
         before = [PlannedBlock(kind, n) for kind, (n, mode) in counts.items() if n and mode in ("Start", "Both")]
         after = [PlannedBlock(kind, n) for kind, (n, mode) in counts.items() if n and mode in ("End", "Both")]
@@ -246,7 +341,7 @@ class TomoscanGuide:
         flat = number("FlatExposureTime") if text("DifferentFlatExposure") == "Different" else None
         exposures = {FrameKind.PROJECTION: self._ride.exposure_s or exposure, FrameKind.FLAT: flat}
         return RidePlan(
-            (*before, PlannedBlock(FrameKind.PROJECTION, views), *after[::-1]),
+            (*before, PlannedBlock(FrameKind.PROJECTION, int(views)), *after[::-1]),
             self._angles,
             {kind: seconds for kind, seconds in exposures.items() if seconds},
             self._ride.period_s,

@@ -23,7 +23,7 @@ from drivers.base.frame import Frame, FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig
 from splatline_areadetector.counters import Counters, Gap, Silence, losses_told
-from splatline_areadetector.guides import EXPOSURE, Guide
+from splatline_areadetector.guides import EXPOSURE, Guide, seconds_of
 from splatline_areadetector.plan import RidePlan
 from splatline_areadetector.sorter import Basis, Decision, NewEpoch, Outside, Place, Seen, Sorter, Unknown
 from splatline_areadetector.stream import Died, Disconnected, FrameStream, Overflow, Refused
@@ -85,6 +85,7 @@ class RiddenFrames:
         self._last: ArrayFrame | None = None  # that has a place
         self._arrived: ArrayFrame | None = None  # the last one
         self._unplaced: dict[str, list[int]] = {}
+        self._unused: dict[str, list[int]] = {}  # numbers of frames that came all the same, by what is wrong with them
         self._block, self._block_kind, self._in_block = -1, "", 0
         self._gone = self._told_of_outside = False
         self._told_pause = self._epoch = ""
@@ -208,8 +209,15 @@ class RiddenFrames:
         try:
             return frame.counts()
         except ValueError as error:
-            self._warn(f"Frame {frame.unique_id}: {error}. It counts as missing.")
+            self._cannot_use(frame, str(error))
         return None
+
+    def _cannot_use(self, frame: ArrayFrame, why: str) -> None:
+        if why not in self._unused:
+            self._warn(
+                f"Frame {frame.unique_id}: {why}. It counts as missing; of others like it this is said at the end."
+            )
+        self._unused.setdefault(why, []).append(frame.unique_id)
 
     def _unknown(self, frame: ArrayFrame, place: Unknown) -> Frame | None:
         """A frame without a place, kept as an invalid row if it has the size of the others. It is said once of each
@@ -245,13 +253,13 @@ class RiddenFrames:
         kind, angle = place.kind, math.nan
         if kind is FrameKind.PROJECTION:
             angle = self._guide.angle(frame, place.trigger)
-            self._views += 1
             if math.isnan(angle):
                 kind = FrameKind.INVALID
                 self._sorter.lose(place)
-                self._warn(f"Nothing tells the angle of frame {frame.unique_id}: it is kept as an invalid row.")
-        exposure = frame.attributes.get(EXPOSURE)
-        seconds = float(exposure) if isinstance(exposure, int | float) else self._plan.exposure(place.kind)
+                self._cannot_use(frame, "nothing tells its angle, so that it is kept as an invalid row")
+            else:
+                self._views += 1
+        seconds = seconds_of(frame.attributes.get(EXPOSURE)) or self._plan.exposure(place.kind)
         self._in_block += 1
         return Frame(counts, kind, self._row, place.trigger, frame.unique_id, angle, frame.time, seconds)
 
@@ -299,6 +307,10 @@ class RiddenFrames:
                 words.append(f"{len(missing)} of {block.n} {noun}s are missing: {spans(missing)}{at}.")
                 if block.kind is FrameKind.PROJECTION and self._plan.told_by != "attribute":
                     words.append(self._first_or_last(missing, ended))
+        for why, ids in self._unused.items():
+            words.append(f"{count(len(ids), 'frame')} came ({spans(ids)}) that did not count: {why}.")
+        if self._unused and self._guide.status:
+            words.append(f"Now: {self._guide.status}.")
         words += losses_told(self._gaps, self._overflowed, self._ride.counters)
         if self._sorter.repeats:
             words.append(f"{count(self._sorter.repeats, 'frame')} came twice and were stored once.")
@@ -340,6 +352,8 @@ class RiddenFrames:
 
     @property
     def _others(self) -> str:
+        if not self._views:
+            return f" The file has {count(self._row, 'frame')}, and no projection with an angle."
         by = "" if self._sorter.basis.is_sure else f", counted from {self._sorter.basis.value}"
         return f" Every other frame is in the file with the angle of its number{by}."
 

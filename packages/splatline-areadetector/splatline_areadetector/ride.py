@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -14,13 +13,14 @@ from beamline.core.errors import BeamlineError, ConfigError
 from beamline.core.events import Sink
 from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted
+from beamline.scan.live_process import Standby
 from beamline.scan.run import record_scan
 from beamline.storage.readers.reference_files import load_images
 from drivers.base.frame import FrameKind
 from splatline_areadetector.arrays import ArrayFrame
 from splatline_areadetector.config import RideConfig, TomoscanAngles
 from splatline_areadetector.counters import Counters, Silence, refuse_mistakes
-from splatline_areadetector.guides import EXPOSURE, Guide, guide_of
+from splatline_areadetector.guides import EXPOSURE, Guide, guide_of, seconds_of
 from splatline_areadetector.plan import PlannedBlock, RidePlan, ready_of
 from splatline_areadetector.ridden import (
     SECOND,
@@ -36,8 +36,15 @@ from splatline_areadetector.sorter import BY_ORDER, NOT_TOLD, Seen, n_before_vie
 from splatline_areadetector.stream import FrameStream, Refused
 
 
-def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
+class NoScanError(ScanAborted):
+    """A stop while a scan was waited for."""
+
+
+def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> RunResult:
     """Record the next scan of the stream: in a run, or in one for each epoch of its frames' numbers.
+
+    Args:
+        live: warms up while a scan is waited for, and makes its live volume; None: there is none.
 
     Raises:
         ConfigError: the frames cannot be stored, or no angles follow for them; nothing was recorded.
@@ -47,6 +54,8 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
     config, lost = ride.config.as_scan, None
     first_id = ride.config.ride.first_id
     while True:
+        if live is not None:
+            live.prepare()
         first, before = wait_for_scan(ride, first_id, joined=lost is not None)
         refuse_mistakes(ride.config, ride.counters, first)
         own = _with_exposure(ride.guide.plan(), ride, first)
@@ -54,9 +63,7 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: bool) -> RunResult:
         ready = ready_of(ride.config, plan, first, ride.runs)
         source_of = partial(RiddenFrames, ride, own, first_id, before, lost is not None)
         try:
-            result = record_scan(
-                config, ready, source_of, ride.runs, sinks, ride.stop, live=live and ride.config.recon.live
-            )
+            result = record_scan(config, ready, source_of, ride.runs, sinks, ride.stop, live=live)
         except EpochEndedError as error:
             lost, first_id = error, None  # numbers of another epoch
             continue
@@ -72,7 +79,7 @@ def wait_for_scan(ride: Ride, first_id: int | None, *, joined: bool) -> tuple[Ar
         joined: a file has ended within the scan.
 
     Raises:
-        ScanAborted: a stop was requested.
+        NoScanError: a stop was requested.
         ConfigError: the frames cannot be stored.
         InstrumentError: the server does not answer.
     """
@@ -82,7 +89,8 @@ def wait_for_scan(ride: Ride, first_id: int | None, *, joined: bool) -> tuple[Ar
     before = None if known is None else Seen(known.unique_id, BY_ORDER, known.time)
     if joined and known is not None:
         before = seen_of(known, guide)
-    ride.say(f"Waiting for the first frame of a scan from {stream.name}{_shown(ride)}")
+    now = f" Now: {guide.status}." if guide.status else ""
+    ride.say(f"Waiting for the first frame of a scan from {stream.name}{_shown(ride)}{now}")
     while not ride.stop.stopping:
         item = stream.next(SLICE)
         if isinstance(item, Refused):
@@ -103,7 +111,7 @@ def wait_for_scan(ride: Ride, first_id: int | None, *, joined: bool) -> tuple[Ar
         if not told:
             told = True
             ride.say(outside_sentence(guide))
-    raise ScanAborted(f"Interrupted before the first frame: {ride.stop.reason}. Nothing was recorded.")
+    raise NoScanError(f"Interrupted before the first frame: {ride.stop.reason}. Nothing was recorded.")
 
 
 def _begins(seen: Seen, ride: Ride, first_id: int | None) -> bool:
@@ -140,10 +148,9 @@ def _shown(ride: Ride) -> str:
 
 def _exposure(ride: Ride, planned: float | None, first: ArrayFrame) -> float | None:
     """s of a view, by the first that tells: configuration, plan, frame, camera; None: nothing does."""
-    camera, told = ride.counters.camera, first.attributes.get(EXPOSURE)
-    by_frame = float(told) if isinstance(told, int | float) else None
-    by_camera = None if camera is None else camera.number("AcquireTime_RBV")
-    return ride.config.ride.exposure_s or planned or by_frame or by_camera or None
+    camera, by_frame = ride.counters.camera, seconds_of(first.attributes.get(EXPOSURE))
+    by_camera = None if camera is None else seconds_of(camera.number("AcquireTime_RBV"))
+    return ride.config.ride.exposure_s or seconds_of(planned) or by_frame or by_camera
 
 
 def _with_exposure(plan: RidePlan, ride: Ride, first: ArrayFrame) -> RidePlan:
@@ -155,9 +162,9 @@ def _with_exposure(plan: RidePlan, ride: Ride, first: ArrayFrame) -> RidePlan:
             "Set ride.exposure_s. Nothing was recorded."
         )
     camera = ride.counters.camera
-    period = plan.period or (None if camera is None else camera.number("AcquirePeriod_RBV"))
-    exposures = {**plan.exposures, FrameKind.PROJECTION: seconds}
-    return replace(plan, exposures=exposures, period=period if period and math.isfinite(period) else None)
+    period = plan.period or (None if camera is None else seconds_of(camera.number("AcquirePeriod_RBV")))
+    exposures = {kind: each for kind, each in plan.exposures.items() if seconds_of(each)}
+    return replace(plan, exposures={**exposures, FrameKind.PROJECTION: seconds}, period=period)
 
 
 def _with_given(plan: RidePlan, given: Images, shape: tuple[int, int]) -> RidePlan:

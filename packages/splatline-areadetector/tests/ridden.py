@@ -77,7 +77,7 @@ def ride_along(
             stream, guide, counters = opened(config, held)
             ride = Ride(config, stream, guide, counters, given or {}, folder / "runs", stop, say)
             for _ in range(scans):
-                ride_scan(ride, [told.events.append], live=False)
+                ride_scan(ride, [told.events.append], live=None)
         except Exception as error:
             told.error = error
         ended.set()

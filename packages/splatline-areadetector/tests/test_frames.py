@@ -7,6 +7,7 @@ import json
 import signal
 import sys
 import time
+import tracemalloc
 from typing import Any
 
 import h5py
@@ -62,6 +63,28 @@ def test_chunks_of_a_file_with_their_header_are_decoded_too() -> None:
 def test_a_damaged_frame_says_so() -> None:
     with pytest.raises(ValueError, match="its bslz4 pixels cannot be decoded"):
         decoded("bslz4", np.zeros(20, np.uint8), (4, 4), np.dtype("u2"))
+
+
+@pytest.mark.parametrize("sides", [(0, 16), (24, 0), (0, 0), (65536, 65536), (10**9, 1), (20000, 20000)])
+@pytest.mark.parametrize("codec", ["", *CODECS])
+def test_sizes_that_no_frame_has_are_refused_before_memory_is_taken(codec: str, sides: tuple[int, int]) -> None:
+    value = array_value(np.zeros((2, 2048), np.uint16 if not codec else np.uint8), 1)
+    if codec:
+        value.codec = {"name": codec, "parameters": 6}
+    value.dimension = [{"size": n, "offset": 0, "fullSize": n, "binning": 1, "reverse": False} for n in sides]
+    began = time.monotonic()
+    with pytest.raises(FrameRefusedError, match=f"its dimensions say {sides[1]} x {sides[0]} uint16; expected as many"):
+        array_frame(value, 0.0)
+    assert time.monotonic() - began < 1
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_pixels_that_a_message_cannot_hold_are_not_looked_for(codec: str) -> None:
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=r"pixels cannot be decoded \(they are fewer than 16384 x 16384\)"):
+        decoded(codec, np.ones(4096, np.uint8), (16384, 16384), np.dtype("u2"))
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()
 
 
 def test_window_and_attributes() -> None:

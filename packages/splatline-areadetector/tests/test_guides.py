@@ -15,7 +15,7 @@ import pytest
 from fake_ioc import TOMOSCAN, FakeIoc, array_value, counts_of
 from ridden import config_of
 
-from beamline.core.errors import ConfigError
+from beamline.core.errors import ConfigError, DataError
 from drivers.base.errors import DeviceTimeout
 from drivers.base.frame import FrameKind
 from splatline_areadetector.arrays import ArrayFrame, array_frame
@@ -100,8 +100,14 @@ def test_kinds_by_order_and_by_attribute(tmp_path: Path) -> None:
     assert [block.n for block in guide.plan().blocks] == [2, 3, 2]
     assert guide.phase(_frame(7, SampleRotary=1.0)) == BY_ORDER
     assert guide.angle(_frame(9, SampleRotary=90.0), 0) == pytest.approx(math.pi / 2)
+    assert guide.phase(_frame(15)) == guide.phase(_frame(16, SampleRotary=1.0))  # one frame that lacks it ends nothing
+    angles_told = [
+        guide.angle(_frame(9, **told), 0) for told in ({}, {"SampleRotary": math.inf}, {"SampleRotary": 1e9})
+    ]
+    assert np.isnan(angles_told).all()
+    lacking = guide_of(config_of(tmp_path, "pva://P:I", angles).ride)
     with pytest.raises(ConfigError, match="SampleRotary, an attribute that the frames do not have; they have ColorM"):
-        guide.phase(_frame(9))
+        lacking.phase(_frame(9))
     guide = guide_of(config_of(tmp_path, "pva://P:I", angles, kinds="K").ride)
     told = [guide.phase(_frame(i, SampleRotary=1.0, K=word)) for i, word in enumerate(("flat", "data", "x", ""))]
     assert told == [Phase(0, FrameKind.FLAT), Phase(0, FrameKind.PROJECTION), NO_SCAN, NOT_TOLD]
@@ -123,6 +129,147 @@ def test_a_pandaboxs_file_is_followed(tmp_path: Path) -> None:
         file.flush()
         assert np.degrees(guide.angle(_frame(1), 2)) == pytest.approx(15.0)
         assert math.isnan(guide.angle(_frame(1), 3))
+
+
+def _panda(folder: Path, views: int = 20, **angles: Any) -> Any:
+    """The guide of a PandABox's file, which waits 0.2 s for what is not there."""
+    given = {"from": "panda", "views": views, "file": str(folder / "panda.h5"), **angles}
+    guide: Any = guide_of(config_of(folder, "pva://P:I", given).ride)
+    guide._wait = 0.2
+    return guide
+
+
+DEGREES = np.linspace(0.0, 171.0, 20)
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence"),
+    [
+        (None, "INENC1.VAL.Value is not there; set ride.angles.dataset to the positions, such as /INENC1.VAL.Value"),
+        ({}, "is a group; set ride.angles.dataset"),
+        (np.array([b"9"] * 20), "holds text, not numbers"),
+        (np.ones(20, bool), "holds bool, not numbers"),
+        (np.zeros((20, 2)), r"has the shape \(20, 2\), not a number a trigger"),
+        (5.0, r"has the shape \(\), not a number a trigger"),
+        (np.arange(21.0), "has 21 rows, and ride.angles.views is 20: move the file of another scan away, or set views"),
+        (np.radians(DEGREES), "has steps of 0.1571, as of radians; set ride.angles.deg_per_unit to 57.29578"),
+        (np.linspace(0, 2 * np.pi, 20), "as of radians"),
+        (np.radians(DEGREES[::-1]) + 100, "as of radians"),
+        (np.arange(20) * 5000, "has steps of 5000, as of encoder counts; set ride.angles.deg_per_unit to 360 / counts"),
+        (np.arange(20) * -50.0, "as of encoder counts"),
+        (np.arange(20) * 1234.5, "as of encoder counts"),
+        (np.full(20, np.nan), "has 0 positions in 20 rows, and they do not change"),
+        (np.full(20, 7.0), "has 20 positions in 20 rows, and they do not change"),
+    ],
+)  # fmt: skip
+def test_a_pandaboxs_file_that_tells_no_angles_is_refused_before_the_scan(
+    tmp_path: Path, data: Any, sentence: str
+) -> None:
+    with h5py.File(tmp_path / "panda.h5", "w") as file:
+        if isinstance(data, dict):
+            file.create_group("INENC1.VAL.Value")
+        elif data is not None:
+            file["INENC1.VAL.Value"] = data
+    with pytest.raises(ConfigError, match=sentence):
+        _panda(tmp_path)
+
+
+def test_a_file_that_is_no_hdf5_is_refused_before_the_scan(tmp_path: Path) -> None:
+    (tmp_path / "panda.h5").write_text("12.5\n")
+    with pytest.raises(ConfigError, match=r"panda.h5 cannot be read as HDF5.*Nothing was started"):
+        _panda(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("data", "angles", "ends"),
+    [
+        (DEGREES, {}, "0° to 171°"),
+        (DEGREES[::-1], {}, "171° to 0°"),
+        (DEGREES.astype("f4"), {}, "0° to 171°"),
+        (9 * np.arange(20), {}, "0° to 171°"),
+        (np.radians(DEGREES), {"deg_per_unit": 57.29577951308232}, "0° to 171°"),
+        (np.arange(20) * 5000, {"deg_per_unit": 0.0018, "offset_deg": -5}, "-5° to 166°"),
+        (np.arange(20) * 137.5077, {}, "0° to 2612.65°"),  # golden angles
+        (np.radians(DEGREES), {"deg_per_unit": 1}, "0° to 2.98451°"),  # a degree it is, says the configuration
+    ],
+)
+def test_a_pandaboxs_file_that_is_there_says_what_it_has(tmp_path: Path, data: Any, angles: Any, ends: str) -> None:
+    with h5py.File(tmp_path / "panda.h5", "w") as file:
+        file["INENC1.VAL.Value"] = data
+    guide = _panda(tmp_path, **angles)
+    assert f"panda.h5 has 20 rows, {ends}, which are this scan's unless it is written anew" in guide.status
+    told = [math.degrees(guide.angle(_frame(1), i)) for i in range(20)]
+    factor, offset = angles.get("deg_per_unit", 1), angles.get("offset_deg", 0)
+    assert np.allclose(told, factor * np.asarray(data, float) + offset, atol=1e-4)
+
+
+def test_rows_that_are_no_position_and_rows_that_do_not_come_are_no_angle(tmp_path: Path) -> None:
+    rows = DEGREES[:15].copy()
+    rows[3], rows[7] = np.nan, np.inf
+    with h5py.File(tmp_path / "panda.h5", "w") as file:
+        file["INENC1.VAL.Value"] = rows
+    guide, began = _panda(tmp_path), time.monotonic()
+    told = np.degrees([guide.angle(_frame(1), i) for i in range(20)])
+    assert np.flatnonzero(np.isnan(told)).tolist() == [3, 7, 15, 16, 17, 18, 19]
+    assert time.monotonic() - began < 1.5  # it waits for the first of the rows that do not come, and not for each
+
+
+def test_a_file_is_read_anew_for_each_scan_and_rows_beyond_its_views_are_left(tmp_path: Path) -> None:
+    path, guides = tmp_path / "panda.h5", []
+    assert _panda(tmp_path).status.endswith("panda.h5 is not there yet")
+    for start in (0.0, 5.0):
+        with h5py.File(path, "w") as file:
+            file["INENC1.VAL.Value"] = start + DEGREES
+        guides = guides or [_panda(tmp_path)]
+        guides[0].plan()
+        assert math.degrees(guides[0].angle(_frame(1), 2)) == pytest.approx(start + 18)
+    with h5py.File(path, "w") as file:
+        file["INENC1.VAL.Value"] = DEGREES[:2]
+    guides[0].plan()
+    with h5py.File(path, "w") as file:  # while frames come, triggers that are nobody's
+        file["INENC1.VAL.Value"] = np.arange(30.0) * 9
+    assert math.degrees(guides[0].angle(_frame(1), 19)) == pytest.approx(171)
+    with pytest.raises(ConfigError, match=r"has 30 rows, and ride\.angles\.views is 20"):
+        guides[0].plan()
+
+
+def test_a_missing_file_is_refused_with_the_first_projection(tmp_path: Path) -> None:
+    """It may come after the darks."""
+    with pytest.raises(ConfigError, match=r"panda.h5 \(ride.angles.file\) is not there. Nothing was recorded"):
+        _panda(tmp_path).plan()
+    given = {"from": "panda", "views": 20, "file": str(tmp_path / "panda.h5")}
+    guide: Any = guide_of(config_of(tmp_path, "pva://P:I", given, darks={"count": 2}).ride)
+    guide._wait = 0.2
+    assert len(guide.plan().blocks) == 2
+    with pytest.raises(DataError, match=r"is not there: no projection has an angle\. What came before is in the file"):
+        guide.angle(_frame(1), 0)
+
+
+@pytest.mark.usefixtures("loopback")
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"NumAngles": math.inf}, "NumAngles is inf"),
+        ({"NumAngles": math.nan}, "NumAngles is nan"),
+        ({"NumAngles": 1e9}, r"NumAngles is 1e\+09"),
+        ({"NumAngles": -3.0}, "NumAngles is -3"),
+        ({"RotationStart": math.inf}, "RotationStart inf"),
+        ({"RotationStep": math.nan}, "RotationStep nan"),
+        ({"RotationStep": 1e9}, r"RotationStep 1e\+09"),
+        ({"NumDarkFields": -3.0}, "NumDarkFields -3"),
+        ({"NumFlatFields": 1e9}, r"NumFlatFields 1e\+09"),
+        ({"NumFlatFields": math.nan}, "NumFlatFields nan"),
+    ],
+)
+def test_numbers_of_tomoscan_from_which_no_plan_follows(
+    tmp_path: Path, changed: dict[str, float], sentence: str
+) -> None:
+    with FakeIoc() as ioc:
+        ioc.tomoscan(**TOMOSCAN | changed)
+        guide = guide_of(config_of(tmp_path, ioc.url, {"from": "tomoscan", "prefix": "pva://T:TomoScan:"}).ride)
+        with pytest.raises(ConfigError, match=sentence):
+            guide.plan()
+        guide.close()
 
 
 @pytest.mark.usefixtures("loopback")

@@ -119,8 +119,8 @@ def read_volume(
             raise DataError(
                 f"{path}: {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels take {size(needed)}, and "
                 f"{size(memory)} may be used{' for each of several volumes' if whole else ''}. Free memory, give more "
-                f"--memory{', fewer --slices' if whole else ''}{', --crop square' if crop == 'none' else ''}, or measure a part "
-                "of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
+                f"--memory{', fewer --slices' if whole else ''}{', --crop square' if crop == 'none' else ''}, or measure "
+                "a part of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
             )
         excess = max(end - first - most, 0)
         fitting = slice(first + excess // 2, end - (excess - excess // 2))

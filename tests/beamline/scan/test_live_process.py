@@ -1,6 +1,8 @@
 """The live reconstruction beside a scan: its story is told among ours; neither its life nor its death costs a frame."""
 
+import json
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,7 @@ import pytest
 
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
-from beamline.core.process import ChildProcess
+from beamline.core.process import ChildProcess, ProcessEnd
 from beamline.core.recon_events import LawMeasured
 from beamline.core.run_result import RunResult
 from beamline.core.stop import ScanAborted, StopRequest
@@ -17,7 +19,7 @@ from beamline.plan.passes import Choice
 from beamline.scan import live_process
 from beamline.scan import measurement as module
 from beamline.scan.live_plan import LivePlan
-from beamline.scan.live_process import LiveReconstruction, follow_command
+from beamline.scan.live_process import LiveReconstruction, Standby, follow_command
 from beamline.scan.run import run_scan
 from tests.beamline.chosen import Scripted, choosing
 from tests.beamline.fakes import FakeInstrument
@@ -172,8 +174,8 @@ def test_a_defect_of_the_run_leaves_no_live_reconstruction_behind(
     started: list[ChildProcess] = []
 
     class Kept(LiveReconstruction):
-        def __init__(self, *args: Any) -> None:
-            super().__init__(*args)
+        def __init__(self, *args: Any, **more: Any) -> None:
+            super().__init__(*args, **more)
             assert self._process is not None
             started.append(self._process)
 
@@ -356,3 +358,33 @@ def test_one_that_is_ended_may_deliver_what_it_has_but_in_a_hurry_it_is_not_wait
         assert done is None and said[-1] == "warning"
     else:
         assert done is not None and done["output"] == str(tmp_path / "recon.h5") and "warning" not in said
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_process_that_waits_becomes_the_command(tmp_path: Path, killed: bool) -> None:
+    """One that has died meanwhile is replaced."""
+    standby, lines, ended = Standby(), list[str](), threading.Event()
+    standby.prepare()
+    waiting = standby._process
+    assert waiting is not None
+    standby.prepare()
+    assert standby._process is waiting
+    if killed:
+        waiting.end()
+    log = tmp_path / "recon.log"
+    words = [sys.executable, "-m", "beamline.cli.main", "recon", str(tmp_path / "no.h5"), "--json", "--beside-scan"]
+    with log.open("x") as stderr:
+        process = standby.start(words, stderr, lines.append, on_end=ended.set, tether=True, behind=True)
+    assert (process is waiting) is not killed and standby._process is None
+    assert process.wait(seconds=120) is ProcessEnd.EXITED and process.code == 5 and ended.is_set()
+    assert json.loads(lines[-1])["event"] == "failed" and "no.h5" in lines[-1]
+    standby.close()
+
+
+def test_a_process_that_waits_ends_with_its_owner(tmp_path: Path) -> None:
+    standby = Standby()
+    standby.prepare()
+    waiting = standby._process
+    assert waiting is not None
+    waiting.let_go()
+    assert waiting.wait(seconds=120) is ProcessEnd.EXITED and waiting.code == 0

@@ -1,7 +1,8 @@
 // The runs of a folder as a table, newest first; the name of a folder leads to the page of its run.
 const $ = (name) => document.querySelector(name);
 const PERIOD = 3000;  // ms
-let said = "";
+let said = "", known = -1;
+if (location.hash.startsWith("#act=")) { sessionStorage.setItem("act", location.hash.slice(5)); history.replaceState(null, "", location.pathname); }
 
 function row(cells, kind, link = null) {
   const made = document.createElement("tr");
@@ -23,6 +24,8 @@ async function show() {
     if (text === said) return;
     said = text;
     const { folder, head, rows } = JSON.parse(text);
+    if (known >= 0 && rows.length > known) location.reload();  // beside a program that records: to the page of the run
+    known = rows.length;
     document.title = `Runs in ${folder}`;
     $("#folder").textContent = `${rows.length} ${rows.length === 1 ? "run" : "runs"} in ${folder}`;
     $("thead").replaceChildren(row(head, "th"));

@@ -1,0 +1,33 @@
+"""A process that has loaded what a live reconstruction needs before the scan that it is for begins.
+
+`python -m beamline.cli.standby` then waits for a line of JSON on its stdin, a file for its stderr and the words of a
+command, and is that command from there on. It ends with its stdin.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+
+from beamline.cli.main import run
+
+
+def main() -> None:
+    """Warm up, wait, and run."""
+    import beamline.reconstruct.pipeline  # noqa: F401 - the command does so, too
+    from recon.splatting.r2 import R2
+    from recon.warm_up import warm_up
+
+    warm_up(R2(finish=0))
+    with open(sys.stdin.fileno(), "rb", buffering=0, closefd=False) as told:  # whoever reads stdin next gets the rest
+        if not (line := told.readline()):
+            return
+    log, *words = json.loads(line)
+    os.dup2(os.open(log, os.O_WRONLY | os.O_APPEND), sys.stderr.fileno())
+    sys.argv[1:] = words
+    run()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""`beamline ride --repeat`: one scan after the other until Ctrl-C, also after one that lacks frames."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import sys
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fake_ioc import FakeIoc
+from ridden import PLAN, RideProgram, stored
+
+pytestmark = [
+    pytest.mark.usefixtures("loopback"),
+    pytest.mark.skipif(sys.platform == "win32", reason="no test sends Ctrl-C to one program alone there"),
+]
+WAITING = "Waiting for the first frame"
+
+
+@pytest.mark.parametrize(
+    ("scans", "in_the_midst", "code", "sentence"),
+    [
+        ([range(1, 21), range(21, 41)], False, 0, "Recorded: 2 scans, of which 0 lack frames."),
+        ([range(1, 21), [*range(21, 31), *range(32, 41)], range(41, 61)], False, 5,
+         "Recorded: 3 scans, of which 1 lacks frames. The last such: 1 of 20 projections are missing: 10"),
+        ([range(1, 21)], True, 4, "Recorded: 1 scan before this one, of which 0 lack frames."),
+    ],
+)  # fmt: skip
+def test_scan_after_scan_until_ctrl_c(
+    tmp_path: Path, scans: list[range], in_the_midst: bool, code: int, sentence: str
+) -> None:
+    with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", angles=PLAN) as ride:
+        for n, ids in enumerate(scans, 2):
+            ioc.send(ids)  # type: ignore[arg-type]
+            ride.wait_for(lambda n=n: ride.output.count(WAITING) >= n)  # type: ignore[misc]
+        if in_the_midst:
+            ioc.send(range(101, 106))
+            ride.wait_for(lambda: len([*tmp_path.glob("runs/*/scan.h5")]) == len(scans) + 1)
+        ride.process.send_signal(signal.SIGINT)
+        assert ride.exit_code(60) == code, ride.output
+        assert sentence in " ".join(ride.output.split())
+    files = stored(tmp_path)
+    assert [file.ids.tolist() for file in files[: len(scans)]] == [[*ids] for ids in scans]
+    assert [file.status for file in files[: len(scans)]] == [
+        "complete" if len(ids) == 20 else "failed" for ids in scans
+    ]
+
+
+def test_ctrl_c_before_any_scan_says_that_nothing_was_recorded(tmp_path: Path) -> None:
+    with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", angles=PLAN) as ride:
+        ride.process.send_signal(signal.SIGINT)
+        assert ride.exit_code(60) == 130 and "Nothing was recorded." in ride.output
+
+
+def test_the_page_of_all_scans_has_one_address_from_before_the_first(tmp_path: Path) -> None:
+    with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", "--page", angles=PLAN) as ride:
+        ride.wait_for(lambda: "Page, to control:" in ride.output)
+        (look,) = re.findall("Page, to watch: (http.*)", ride.output)
+        (act,) = re.findall("Page, to control: .*#act=(.*)", ride.output)
+        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        opener.open(look).close()  # its cookie is the token
+        base = look.partition("?")[0]
+
+        def runs() -> list[Any]:
+            with opener.open(f"{base}api/runs") as answer:
+                return list(json.load(answer)["rows"])
+
+        assert runs() == []
+        with opener.open(base) as answer:
+            assert answer.url == base  # a table, while there is no run
+        for n, ids in enumerate((range(1, 21), range(21, 41)), 1):
+            ioc.send(ids)
+            ride.wait_for(lambda n=n: ride.output.count(WAITING) > n)  # type: ignore[misc]
+            assert len(runs()) == n
+            newest = max((tmp_path / "runs").iterdir(), key=lambda run: run.stat().st_ctime)
+            with opener.open(base) as answer, opener.open(f"{answer.url}api/facts") as facts:
+                assert f"{base}run/" in answer.url and json.load(facts)["run"] == newest.name
+            with opener.open(f"{base}api/facts") as answer:
+                told = json.load(answer)
+                assert told["run"] == newest.name and told["may_act"] and act
+        assert ride.output.count("Page, to watch") == 1
+        ride.process.send_signal(signal.SIGINT)
+        assert ride.exit_code(60) == 0
