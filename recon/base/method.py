@@ -279,7 +279,7 @@ class Reconstruction:
         Raises:
             ValueError, KeyError: the file is no .npz, or one of another program.
         """
-        if not is_zipfile(path):
+        if Path(path).exists() and not is_zipfile(path):
             raise ValueError(f"{str(path)!r} is no .npz; expected a file that save wrote")
         with np.load(path, allow_pickle=False) as file:
             data, edge, height = file["volume"], float(file["voxel_mm"]), float(file["slice_mm"])
