@@ -20,8 +20,11 @@ from typing import Any
 from beamline.core.errors import INTERRUPTED, ScanStopped
 from beamline.core.text import printable
 
-_NAMES = ("SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGXCPU")
-_ENDING = [getattr(signal, name) for name in _NAMES if hasattr(signal, name)]
+_ENDING = [
+    getattr(signal, name)
+    for name in ("SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGXCPU")
+    if hasattr(signal, name)
+]
 """Signals that ask a process to end, where the system has them: of a person, a closed terminal, or a batch system."""
 
 

@@ -21,9 +21,9 @@ def restored(values: Any) -> Any:
     """What `named` has made of values, with their NaN and infinities."""
     if isinstance(values, dict):
         return {name: restored(value) for name, value in values.items()}
-    if isinstance(values, list):
-        return [restored(value) for value in values]
-    return _NAMED.get(values, values) if isinstance(values, str) else values
+    if isinstance(values, str):
+        return _NAMED.get(values, values)
+    return [restored(value) for value in values] if isinstance(values, list) else values
 
 
 def plain(value: Any) -> Any:

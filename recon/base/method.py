@@ -266,9 +266,9 @@ class Reconstruction:
         As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON that names NaN and infinities as
         text. Several volumes in time are there, too: `series` float32 [volume, z, y, x] and `series_s`.
         """
-        text = json.dumps(named(self.settings), allow_nan=False)
+        settings = json.dumps(named(self.settings), allow_nan=False)
         several = {} if self.series is None else {"series": self.series.data, "series_s": self.series.seconds}
-        self.volume.save(path, method=self.method, seconds=self.seconds, settings=text, **several)
+        self.volume.save(path, method=self.method, seconds=self.seconds, settings=settings, **several)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -284,10 +284,13 @@ class Reconstruction:
         with np.load(path, allow_pickle=False) as file:
             data, edge, height = file["volume"], float(file["voxel_mm"]), float(file["slice_mm"])
             grid = Grid(data.shape, edge, tuple(file["centre_zyx_mm"]), None if height == edge else height)
-            settings = restored(json.loads(str(file.get("settings", "{}"))))
-            series = VolumeSeries(file["series_s"], file["series"]) if "series" in file else None
-            method, seconds = str(file.get("method", "")), float(file.get("seconds", 0.0))
-        return cls(Volume(data, grid), settings, method=method, seconds=seconds, series=series)
+            return cls(
+                Volume(data, grid),
+                restored(json.loads(str(file.get("settings", "{}")))),
+                method=str(file.get("method", "")),
+                seconds=float(file.get("seconds", 0.0)),
+                series=VolumeSeries(file["series_s"], file["series"]) if "series" in file else None,
+            )
 
 
 class Method(Checked, ABC):

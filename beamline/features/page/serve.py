@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import psutil
@@ -262,7 +261,7 @@ class _Server(uvicorn.Server):
         self._access, self._ignored = access, signal.getsignal(signal.SIGINT) is signal.SIG_IGN
         self._entrances: list[Entrance] = []
 
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+    def handle_exit(self, sig: int, frame: Any) -> None:
         if sig != signal.SIGINT or not self._ignored:  # as of a process that a script started in the background
             super().handle_exit(sig, frame)
 

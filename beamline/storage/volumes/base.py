@@ -99,7 +99,6 @@ class VolumeFormat(Protocol):
 def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
     """Metadata of a volume as JSON, for formats without fields for them: all but arrays and the history."""
     grid = record.volume.grid
-    scalars = {k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray)}
     return {
         "format": VOLUME,
         "program": f"splatline {version()}",
@@ -113,7 +112,7 @@ def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
         "voxel_size": grid.voxel_size,
         "slice_pitch": grid.slice_pitch,
         "centre_zyx": grid.centre,
-        "parameters": named(scalars),
+        "parameters": named({k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray)}),
         "metrics": named(record.metrics),
     }
 
