@@ -15,7 +15,7 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
 from beamline.storage.readers.open import open_scan
-from beamline.storage.recon_record import ReconRecord
+from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.volumes import formats, suffixes_text
 from beamline.storage.volumes.base import Pixels, Slices, facts_of, record_of
 from beamline.storage.volumes.files import format_of, opened_volume, volume_format, write_volume
@@ -71,7 +71,13 @@ def test_everything_that_a_format_holds_comes_back(tmp_path: Path, name: str) ->
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "v.npy"])  # which has the voxels alone
 def test_numbers_that_are_not_finite_come_back_and_go_on_into_any_format(tmp_path: Path, name: str) -> None:
     """Rays of a fit have an infinite limit by default, and a residual of nothing is NaN."""
-    numbers = {"rays_exact_above": math.inf, "lowest": -math.inf, "unknown": math.nan, "text": "inf", "seed": 3}
+    numbers: dict[str, Value] = {
+        "rays_exact_above": math.inf,
+        "lowest": -math.inf,
+        "unknown": math.nan,
+        "text": "inf",
+        "seed": 3,
+    }
     record = replace(RECORD, parameters=numbers, metrics={"residual": math.nan, "psnr": math.inf})
     write_volume(tmp_path / name, record)
     with opened_volume(tmp_path / name) as read:
