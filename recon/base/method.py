@@ -266,9 +266,14 @@ class Reconstruction:
         As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON that names NaN and infinities as
         text. Several volumes in time are there, too: `series` float32 [volume, z, y, x] and `series_s`.
         """
-        settings = json.dumps(named(self.settings), allow_nan=False)
         several = {} if self.series is None else {"series": self.series.data, "series_s": self.series.seconds}
-        self.volume.save(path, method=self.method, seconds=self.seconds, settings=settings, **several)
+        self.volume.save(
+            path,
+            method=self.method,
+            seconds=self.seconds,
+            settings=json.dumps(named(self.settings), allow_nan=False),
+            **several,
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
