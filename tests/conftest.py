@@ -3,6 +3,7 @@
 import gc
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections import defaultdict
@@ -46,7 +47,13 @@ os.environ["XDG_STATE_HOME"] = os.environ["LOCALAPPDATA"] = _STATE.name
 
 def pytest_configure(config: pytest.Config) -> None:
     """Workers that share the cores have one thread each: tiny fits wait for a second one longer than they work, and
-    threads of OpenBLAS burn the time of a core while they wait."""
+    threads of OpenBLAS burn the time of a core while they wait.
+
+    SIGINT is as at a terminal, here and in the processes that tests start: where a script or a CI starts pytest in the
+    background it is ignored, which commands respect.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     config.addinivalue_line("markers", "feature: of a feature's folder, see [tool.splatline.features]")
     # `pytest` alone runs the core's tests; a path, or another -m, runs what it names. The environment tells workers.
     if not hasattr(config, "workerinput"):

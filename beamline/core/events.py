@@ -12,8 +12,6 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, dataclass_transform
 
-import numpy as np
-
 from beamline.core.flag import Flag
 from beamline.core.run_result import RunResult
 
@@ -81,15 +79,9 @@ def json_of(values: object) -> str:
     """One line of JSON; NaN and infinities become null, arrays lists, dataclasses objects, paths strings."""
     from pydantic_core import to_jsonable_python  # here, because most commands write no line
 
-    plain = to_jsonable_python(values, inf_nan_mode="null", fallback=_of_no_json_type)
-    return json.dumps(plain, allow_nan=False)
+    from recon.base.json_values import plain
 
-
-def _of_no_json_type(value: Any) -> Any:
-    """What a line of JSON has in place of a value that pydantic does not know."""
-    if isinstance(value, Mapping):
-        return dict(value)
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+    return json.dumps(to_jsonable_python(values, inf_nan_mode="null", fallback=plain), allow_nan=False)
 
 
 class RunStarted(Event, event="run_started"):

@@ -20,16 +20,19 @@ from typing import Any
 from beamline.core.errors import INTERRUPTED, ScanStopped
 from beamline.core.text import printable
 
-_ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGXCPU")
+_ENDING = [
+    getattr(signal, name)
+    for name in ("SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2", "SIGXCPU")
+    if hasattr(signal, name)
+]
 """Signals that ask a process to end, where the system has them: of a person, a closed terminal, or a batch system."""
 
 
 def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
     """A context in which the first Ctrl-C requests a stop, the second an abort.
 
-    SIGTERM, a closed terminal (SIGHUP, unless `nohup` has it ignored), a closed console of Windows (SIGBREAK) and
-    the signals of batch systems request a stop. Ctrl-Z suspends nothing: the shutter would stay open, and
-    the watchdog would take the scan for dead.
+    SIGTERM, a closed terminal (SIGHUP), a closed console of Windows (SIGBREAK) and the signals of batch systems request
+    a stop. Ctrl-Z suspends nothing: the shutter would stay open, and the watchdog would take the scan for dead.
     """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -49,7 +52,7 @@ def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
         to_stderr("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")
 
     suspended = {signal.SIGTSTP: keep_on} if hasattr(signal, "SIGTSTP") else {}
-    return _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(_asking_to_end(), terminate)})
+    return _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(_ENDING, terminate)})
 
 
 class StopOnSignal:
@@ -67,7 +70,7 @@ class StopOnSignal:
 
     @contextmanager
     def __call__(self) -> Iterator[Callable[[], bool]]:
-        with _caught(dict.fromkeys((signal.SIGINT, *_asking_to_end()), self._on_signal)):
+        with _caught(dict.fromkeys((signal.SIGINT, *_ENDING), self._on_signal)):
             yield lambda: self._requested
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
@@ -81,24 +84,21 @@ def terminated_like_interrupted() -> AbstractContextManager[None]:
     """A context in which SIGTERM, and SIGHUP of a closed terminal, interrupt like Ctrl-C, so that no partial file
     remains.
     """
-    return _caught(dict.fromkeys(_asking_to_end(), signal.default_int_handler))
+    return _caught(dict.fromkeys(_ENDING, signal.default_int_handler))
 
 
 @contextmanager
 def _caught(handlers: dict[signal.Signals, Any]) -> Iterator[None]:
-    """Within the context signals have these handlers, if this is the main thread; afterwards the earlier ones."""
+    """Within the context signals have these handlers, if this is the main thread; afterwards the earlier ones.
+
+    A signal that is ignored stays so: SIGHUP under `nohup`, SIGINT where a script started this in the background.
+    """
     with ExitStack() as restore:
         if threading.current_thread() is threading.main_thread():
             for number, handler in handlers.items():
-                if signal.getsignal(number) is not None:  # None: not Python's, and could not be restored
+                if signal.getsignal(number) not in (None, signal.SIG_IGN):  # None: not Python's, cannot be restored
                     restore.callback(signal.signal, number, signal.signal(number, handler))
         yield
-
-
-def _asking_to_end() -> list[signal.Signals]:
-    """The signals of _ENDING that the system has, and that are not ignored, as SIGHUP under `nohup`."""
-    there = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
-    return [number for number in there if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def to_stderr(text: str) -> None:

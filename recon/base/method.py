@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
+from zipfile import is_zipfile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from recon.base.decisions import Decisions, Stop
 from recon.base.declared_types import Checked, types_of
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
+from recon.base.json_values import named, restored
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 if TYPE_CHECKING:
@@ -261,16 +263,39 @@ class Reconstruction:
     def save(self, path: str | Path) -> None:
         """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
 
-        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON of those that are not arrays; NaN
-        and infinities are null.
+        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON that names NaN and infinities as
+        text. Several volumes in time are there, too: `series` float32 [volume, z, y, x] and `series_s`.
         """
-        settings = {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in self.settings.items()
-            if not isinstance(value, np.ndarray)
-        }
-        text = json.dumps(settings, default=str, allow_nan=False)
-        self.volume.save(path, method=self.method, seconds=self.seconds, settings=text)
+        several = {} if self.series is None else {"series": self.series.data, "series_s": self.series.seconds}
+        self.volume.save(
+            path,
+            method=self.method,
+            seconds=self.seconds,
+            settings=json.dumps(named(self.settings), allow_nan=False),
+            **several,
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """What `save` wrote, or `Volume.save`, which knows neither method nor settings.
+
+        Sequences and arrays among the settings are lists, and what JSON has no type for is text.
+
+        Raises:
+            ValueError, KeyError: the file is no .npz, or one of another program.
+        """
+        if Path(path).exists() and not is_zipfile(path):
+            raise ValueError(f"{str(path)!r} is no .npz; expected a file that save wrote")
+        with np.load(path, allow_pickle=False) as file:
+            data, edge, height = file["volume"], float(file["voxel_mm"]), float(file["slice_mm"])
+            grid = Grid(data.shape, edge, tuple(file["centre_zyx_mm"]), None if height == edge else height)
+            return cls(
+                Volume(data, grid),
+                restored(json.loads(str(file.get("settings", "{}")))),
+                method=str(file.get("method", "")),
+                seconds=float(file.get("seconds", 0.0)),
+                series=VolumeSeries(file["series_s"], file["series"]) if "series" in file else None,
+            )
 
 
 class Method(Checked, ABC):

@@ -17,6 +17,7 @@ from recon.base.method import Method
 from recon.splatting.fit_method import Fit
 from recon.testing import MethodConformance
 from recon.voxels.projector import Projector
+from tests.recon.saved import comes_back
 
 ROOT = Path(__file__).parents[2]
 VIEWS = recon.Geometry.parallel(np.linspace(0, np.pi, 12, endpoint=False), (6, 24), pixel_pitch=0.5)
@@ -86,6 +87,22 @@ def test_names_load_nothing_that_computes() -> None:
     code = "import sys, recon.methods as m; m.names(); m.streams('r2'); print({'torch', 'numba'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("name", [*methods.names(), "auto"])
+def test_what_any_method_makes_is_saved_and_comes_back(
+    name: str, projections: NDArray[np.float32], tmp_path: Path
+) -> None:
+    if name == "auto":
+        method: Method = recon.Auto((recon.Fbp(), recon.R2(steps=4, gaussians=50, finish=1)))
+    elif name in methods.names_of_one_volume():
+        method = methods.by_name(name)().toy()
+    else:
+        method = methods.build(methods.by_name(name), {"sweeps": 1, "weight": 0.01, "moves": False})
+    several = recon.Geometry.parallel(np.tile(VIEWS.angles, method.volumes), VIEWS.detector_shape, pixel_pitch=0.5)
+    views = np.concatenate([projections] * method.volumes)
+    comes_back(recon.reconstruct(views, several, method), tmp_path / "v.npz")
 
 
 class TestConformance(MethodConformance):

@@ -9,6 +9,7 @@ import asyncio
 import ipaddress
 import secrets
 import select
+import signal
 import socket
 import threading
 import time
@@ -273,8 +274,12 @@ class _Server(uvicorn.Server):
 
     def __init__(self, config: uvicorn.Config, access: Access) -> None:
         super().__init__(config)
-        self._access = access
+        self._access, self._ignored = access, signal.getsignal(signal.SIGINT) is signal.SIG_IGN
         self._entrances: list[Entrance] = []
+
+    def handle_exit(self, sig: int, frame: Any) -> None:
+        if sig != signal.SIGINT or not self._ignored:  # as of a process that a script started in the background
+            super().handle_exit(sig, frame)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup([])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from splatline_neural import NAF, IntraTomo, SaxNerf
 from splatline_neural.methods import FieldMethod
 from splatline_neural.networks import LineAttention
 from tests.recon.helpers import data_residual
+from tests.recon.saved import comes_back
 
 ANGLES = np.linspace(0, 2 * np.pi, 12, endpoint=False)
 VIEWS = {
@@ -116,6 +118,11 @@ def test_the_published_grid_has_sixteen_levels_and_ours_ends_at_a_voxel() -> Non
 @pytest.mark.parametrize("method", [NAF(), SaxNerf(), IntraTomo()])
 def test_samples_follow_the_voxels(method: FieldMethod) -> None:
     assert method.samples_of(256) == 320 and method.samples_of(9) == 12
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_result_is_saved_and_comes_back(name: str, tmp_path: Path) -> None:
+    comes_back(recon.reconstruct(box(VIEWS["parallel"])[1], VIEWS["parallel"], SMALL[name].toy()), tmp_path / "v.npz")
 
 
 @pytest.mark.parametrize("name", SMALL)

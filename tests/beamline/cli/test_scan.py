@@ -241,10 +241,18 @@ def test_4_a_terminal_that_nobody_reads_does_not_keep_ctrl_c_from_stopping(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGHUP")
-def test_a_scan_that_nohup_started_outlives_its_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    on(monkeypatch, FakeInstrument(on_frame=press(signal.SIGHUP, 8)))
-    assert scan("-o", str(tmp_path)).exit_code == 0
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGINT", "SIGTERM"])
+def test_a_signal_that_was_ignored_before_the_scan_stays_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """`nohup` starts a process with SIGHUP ignored, a script that starts one in the background with SIGINT."""
+    number = getattr(signal, name)
+    on(monkeypatch, FakeInstrument(on_frame=press(number, 8)))
+    before = signal.signal(number, signal.SIG_IGN)
+    try:
+        assert scan("-o", str(tmp_path)).exit_code == 0
+    finally:
+        signal.signal(number, before)
 
 
 def test_130_a_second_ctrl_c_cuts_the_references_that_a_stop_still_takes(

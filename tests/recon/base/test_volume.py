@@ -199,6 +199,10 @@ def test_a_volume_is_saved_with_its_places_and_nothing_is_overwritten(tmp_path: 
         np.testing.assert_array_equal(saved["volume"], volume.data)
         assert (float(saved["voxel_mm"]), float(saved["slice_mm"]), str(saved["method"])) == (0.5, 0.25, "r2")
         assert tuple(saved["centre_zyx_mm"]) == grid.centre
+    loaded = Reconstruction.load(tmp_path / "v.npz")
+    np.testing.assert_array_equal(loaded.volume.data, volume.data)
+    assert (loaded.volume.grid, loaded.volume.data.dtype) == (grid, np.float32)
+    assert (loaded.method, loaded.settings) == ("r2", {})
     with pytest.raises(FileExistsError, match="not overwritten"):
         volume.save(tmp_path / "v.npz")
     with pytest.raises(ValueError, match="beamline export"):

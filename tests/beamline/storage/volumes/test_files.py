@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +15,9 @@ import tifffile
 from beamline.core.errors import DataError
 from beamline.features.files.validate import validate
 from beamline.storage.readers.open import open_scan
-from beamline.storage.recon_record import ReconRecord
+from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.volumes import formats, suffixes_text
-from beamline.storage.volumes.base import Pixels, Slices
+from beamline.storage.volumes.base import Pixels, Slices, facts_of, record_of
 from beamline.storage.volumes.files import format_of, opened_volume, volume_format, write_volume
 from beamline.storage.volumes.images import tiff
 from recon.base.volume import Grid, Volume
@@ -65,6 +66,31 @@ def test_everything_that_a_format_holds_comes_back(tmp_path: Path, name: str) ->
             assert read.volume.grid == RECORD.volume.grid
             assert (read.parameters["method"], read.metrics) == ("fbp", {"residual": 0.125})
     assert {finding.severity for finding in validate(path)} == {"info"}
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "v.npy"])  # which has the voxels alone
+def test_numbers_that_are_not_finite_come_back_and_go_on_into_any_format(tmp_path: Path, name: str) -> None:
+    """Rays of a fit have an infinite limit by default, and a residual of nothing is NaN."""
+    numbers: dict[str, Value] = {
+        "rays_exact_above": math.inf,
+        "lowest": -math.inf,
+        "unknown": math.nan,
+        "text": "inf",
+        "seed": 3,
+    }
+    record = replace(RECORD, parameters=numbers, metrics={"residual": math.nan, "psnr": math.inf})
+    write_volume(tmp_path / name, record)
+    with opened_volume(tmp_path / name) as read:
+        assert repr(dict(sorted(read.parameters.items()))) == repr(dict(sorted(numbers.items())))
+        assert repr(dict(sorted(read.metrics.items()))) == repr({"psnr": math.inf, "residual": math.nan})
+        for other in NAMES:
+            write_volume(tmp_path / f"again_{other}", read)
+
+
+def test_a_file_of_an_earlier_version_has_null_in_place_of_such_a_number() -> None:
+    facts = {**facts_of(RECORD, Pixels()), "parameters": {"seed": 3, "rays": None}, "metrics": {"snr": None}}
+    read = record_of(Path("v.tif"), facts, VALUES)
+    assert read.parameters == {"seed": 3} and math.isnan(read.metrics["snr"])
 
 
 def test_other_programs_read_the_same(tmp_path: Path) -> None:

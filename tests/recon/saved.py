@@ -1,0 +1,42 @@
+"""What `Reconstruction.save` writes, compared with what `load` gives back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import recon
+
+
+def comes_back(result: recon.Reconstruction, path: Path) -> None:
+    """Save, load and compare all that a file holds of a result; its JSON is one for every reader."""
+    result.save(path)
+    with np.load(path, allow_pickle=False) as file:
+        json.loads(str(file["settings"]), parse_constant=_refused)
+    loaded = recon.Reconstruction.load(path)
+    np.testing.assert_array_equal(loaded.volume.data, result.volume.data)
+    assert loaded.volume.data.dtype == np.float32 and loaded.volume.grid == result.volume.grid
+    assert (loaded.method, loaded.seconds) == (result.method, result.seconds)
+    assert repr(loaded.settings) == repr(_as_lists(result.settings))  # which compares NaN, too
+    assert (loaded.series is None) == (result.series is None)
+    if loaded.series is not None and result.series is not None:
+        np.testing.assert_array_equal(loaded.series.data, result.series.data)
+        np.testing.assert_array_equal(loaded.series.seconds, result.series.seconds)
+
+
+def _refused(word: str) -> None:
+    raise AssertionError(f"{word} is no JSON")
+
+
+def _as_lists(value: Any) -> Any:
+    """A setting with lists for tuples and arrays, and text for other objects."""
+    if isinstance(value, dict):
+        return {name: _as_lists(each) for name, each in value.items()}
+    if isinstance(value, tuple | list):
+        return [_as_lists(each) for each in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return value if isinstance(value, int | float | None) else str(value)
