@@ -18,11 +18,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import serial
-from serial.tools import list_ports
-
+from drivers.base.causes import NO_TEXT, TELNET, of_bytes, of_port
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
+from drivers.serial import list_ports, serial
 from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, Transcript, readable
 
 
@@ -43,15 +42,23 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
         OSError, ValueError: it does not open.
     """
     port = serial.serial_for_url(url, baudrate=baudrate, timeout=quiet, write_timeout=write_timeout, exclusive=True)
-    if url.lower().startswith("socket://"):
+    if _is_socket(url):
         # Send each request at once: Nagle's algorithm, which gathers small packets, costs 40 to 200 ms for every
         # command and its read-back.
         with contextlib.suppress(OSError), socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as copy:
             copy.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            port.reset_input_buffer()  # other kinds of port do this at opening
     return port
 
 
+def _is_socket(url: str) -> bool:
+    return url.lower().startswith("socket:")
+
+
+_OTHER_CLIENT = "Many terminal servers serve one client: another program may hold this port of it"
+_CLOSED = (
+    "Let the server keep a connection without traffic (idle time 0), and see that no other client takes its port. Then "
+    "start again"
+)
 NEVER = r"(?!)"  # A form that no line has
 QUIET = 0.05  # s without a byte after which a line counts as silent
 
@@ -73,6 +80,8 @@ class LineRules:
             recorded.
         identified: each reply has the number of its request, so that a second one comes from another device.
         check: returns the fault of a received line, "" if it is good; for checksums.
+        text: no reply has control characters or bytes above 7F; one that has them is refused, whatever its form.
+        unanswered: what else to do about a device that has never answered.
     """
 
     probe: Probe
@@ -80,6 +89,8 @@ class LineRules:
     framing: Framing = CRLF
     identified: bool = False
     check: Callable[[str], str] = lambda line: ""
+    text: bool = True
+    unanswered: str = ""
 
 
 class SerialLine:
@@ -108,9 +119,9 @@ class SerialLine:
         transcript: Path | None = None,
     ) -> None:
         self._device, self._probe, self._clock, self._timeout = device, rules.probe, clock, timeout
+        self._url, self._rules, self._has_answered = url, rules, False
         self._asking, self._writing = threading.RLock(), threading.Lock()
-        self._framing, self._in_step, self._closed = rules.framing, True, False
-        self._identified = rules.identified
+        self._in_step, self._closed = True, False
         self._answered = "", NEVER  # the last request that was answered, and the form of its reply
         if not 0 < timeout < math.inf:
             raise DeviceRefused(
@@ -138,8 +149,7 @@ class SerialLine:
                 device,
                 f"the port {url!r} does not open: {problem}",
                 expected="a port like /dev/ttyUSB0, COM3, socket://host:port or sim://pm16c",
-                advice="Check the cable, the port's name in the configuration and that no other program holds it. "
-                f"Serial ports of this computer: {serial_ports()}",
+                advice=f"{of_port(url, problem)}. Serial ports of this computer: {serial_ports()}",
                 state="Nothing was sent",
             ) from problem
         self._reader = LineReader(self._port, clock, self._transcript, rules.framing, rules.unsolicited, rules.check)
@@ -173,13 +183,18 @@ class SerialLine:
                 if not self._in_step:
                     self._resynchronise(request, state)
                 self._in_step = False
-                for line in self._reader.discard_lines():
+                for line in self._reader.discard_lines(whole_only=self._has_answered or not _is_socket(self._url)):
                     self._refuse_second_reply(line, state)
                 self._write(data, request)
                 text = self._reader.reply(self._clock.now() + self._timeout)
-            if isinstance(text, str) and (match := re.fullmatch(reply, text)) is not None:
-                self._in_step = True
-                self._answered = (request, reply) if self._identified else self._answered
+            if (
+                isinstance(text, str)
+                and (match := re.fullmatch(reply, text)) is not None
+                and not self._is_foreign(text, to_bytes=isinstance(command, bytes))
+            ):
+                self._in_step = self._has_answered = True
+                self._reader.heard = ""
+                self._answered = (request, reply) if self._rules.identified else self._answered
                 return match
             if isinstance(text, str):
                 self._refuse_second_reply(text, state)
@@ -209,7 +224,7 @@ class SerialLine:
         """The bytes to send, and their text for messages."""
         if isinstance(command, bytes):
             return command, readable(command)
-        return command.encode("ascii") + self._framing.command_end, command or "an empty line"
+        return command.encode("ascii") + self._rules.framing.command_end, command or "an empty line"
 
     def _resynchronise(self, request: str, state: str) -> None:
         """Discard what arrives, send the probe, skip late replies until its own, and wait for silence."""
@@ -230,7 +245,7 @@ class SerialLine:
                 state=state,
             )
         self._wait_for_quiet(request, state)
-        self._in_step = True
+        self._in_step, self._reader.heard = True, ""
         self._transcript.add_line("!", "in step again")
 
     def _refuse_second_reply(self, line: str, state: str) -> None:
@@ -281,15 +296,19 @@ class SerialLine:
                 advice="Check power, cable and flow control (none is expected)",
                 state=state,
             ) from problem
-        except OSError as problem:
+        except OSError as error:
+            failure, advice = f"{error}", "Check that the cable or adapter is still plugged in, then start again"
+            if _is_socket(self._url):
+                failure += f"; the other side closed the connection, {self._reader.silence:.1f} s after its last byte"
+                advice = _CLOSED
             raise self._error(
                 DeviceError,
-                f"the port failed: {problem}",
+                f"the port failed: {failure}",
                 request=request,
                 expected="a port that stays open",
-                advice="Check that the cable or adapter is still plugged in, then start again",
+                advice=advice,
                 state=state,
-            ) from problem
+            ) from error
 
     def _refuse_if_closed(self, request: str) -> None:
         """Raise DeviceError if the line is closed: operating systems raise different errors for a closed port."""
@@ -298,7 +317,22 @@ class SerialLine:
                 self._device, "it was closed", request=request, advice="Open it again", state="Nothing was sent"
             )
 
+    def _is_foreign(self, text: str, *, to_bytes: bool) -> bool:
+        """Whether a reply of the right form is none, since others speak on this line. `to_bytes`: it answers a control
+        byte, perhaps by one.
+        """
+        strange = self._rules.text and not to_bytes and NO_TEXT.search(text) is not None
+        return strange or of_bytes(self._url, self._reader.heard) is TELNET
+
     def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
+        """The error, with its cause where the bytes since the last good reply show it."""
+        cause, todo = of_bytes(self._url, self._reader.heard)
+        advice = [todo or parts.pop("advice")]
+        if not self._has_answered:
+            silent = _is_socket(self._url) and not self._reader.heard
+            advice += [_OTHER_CLIENT if silent else "", self._rules.unanswered]
+        problem = f"{problem}: {cause}" if cause else problem
+        parts["advice"] = ". ".join(filter(None, advice))
         return kind(self._device, problem, wire=self._transcript.recent(), **parts)
 
 
