@@ -157,12 +157,17 @@ def guard_streams() -> None:
     both, and stdin, are open from now on.
 
     The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
+    What a library of others prints to stdout, also at the end of the process, goes to stderr: a line of it in `--json`
+    is no JSON.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         os.set_inheritable(number, True)
     os.close(number)
     streams: Any = sys  # typeshed knows text files alone
-    streams.stdout = _Printable(_Lasting(sys.stdout or _nowhere()))
+    if getattr(out := sys.stdout or _nowhere(), "name", "") == "<stdout>":  # and not what a host put there
+        out = open(os.dup(1), "w", encoding=out.encoding, errors=out.errors, buffering=1 if out.isatty() else -1)  # noqa: PTH123, SIM115
+        os.dup2(2, 1)
+    streams.stdout = _Printable(_Lasting(out))
     streams.stderr = _Printable(_Lasting(sys.stderr or _nowhere()))
 
 

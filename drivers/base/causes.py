@@ -7,105 +7,92 @@ from __future__ import annotations
 
 import errno
 import os
-import platform
 import re
-import struct
+import sysconfig
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
-
-class Cause(NamedTuple):
-    """What is the matter, and what to do. Both are empty where nothing is known."""
-
-    what: str = ""
-    advice: str = ""
-
-
-THIS_PYTHON = f"this Python is for {8 * struct.calcsize('P')} bits on {platform.machine() or 'an unknown processor'}"
-_OTHER_KIND = Cause(f"it is for another kind of computer; {THIS_PYTHON}", "Install the library for this computer")
-_LOADERS: tuple[tuple[str, Cause], ...] = (
-    (r"ELFCLASS(\d+)", Cause(f"it is for {{0}} bits; {THIS_PYTHON}", _OTHER_KIND.advice)),
-    (r"WinError 193|incompatible architecture|not a mach-o", _OTHER_KIND),
+OTHER_KIND = "it is for another kind of computer, and this Python is of " + sysconfig.get_platform()
+_LOADERS = (
+    (r"ELFCLASS(\d+)", "it is for {0} bits, and this Python is not", "Give the library for this Python"),
+    (r"^itself: cannot open|WinError 193|incompatible arch|mach-o", OTHER_KIND, "Give the library for this computer"),
     (
         r"([^\s:(]+): cannot open shared|Library not loaded: (\S+)",
-        Cause("it needs {0}, which is not found", "Install what has {0}, or add its folder to LD_LIBRARY_PATH"),
+        "it needs {0}, which is not found",
+        "Install what has {0}, or add its folder to LD_LIBRARY_PATH",
     ),
     (
         r"one of its dependencies|WinError 126",
-        Cause("a library that it needs is not found", "Install the vendor's runtime again, with all its parts"),
+        "a library that it needs is not found",
+        "Install the vendor's runtime again, with all its parts",
     ),
     (
         r"(?:undefined symbol:|symbol not found[^:]*:|version) (\S+)",
-        Cause("it does not fit the other libraries here: {0} is missing", "Install the version for this system"),
+        "it does not fit the other libraries here: {0} is missing",
+        "Install the version that was made for this system",
     ),
-)
-"""What the loaders of Linux, macOS and Windows say of a library that is there."""
+    ("", "it is there, but no library that can be loaded", "Check the file, and the right to read it"),
+)  # what the loaders of Linux (which calls one for another processor not found), macOS and Windows say
 
 
-def of_library(name: str, problem: OSError) -> Cause:
-    """Why a library that is there is not loaded; empty if it is not there."""
-    if not Path(name).exists():
-        return Cause()
-    for said, cause in _LOADERS:
-        if match := re.search(said, str(problem), re.IGNORECASE):
+def of_library(name: str, problem: OSError) -> tuple[str, str]:
+    """Why a library is not loaded, and what to do; both empty where it is not there."""
+    for said, what, advice in _LOADERS if Path(name).exists() else ():
+        if match := re.search(said, str(problem).replace(name, "itself"), re.IGNORECASE):
             named = next(filter(None, match.groups()), "")
-            if Path(named).name == Path(name).name:  # so Linux says of a library for another processor
-                return _OTHER_KIND
-            return Cause(*(text.format(named) for text in cause))
-    return Cause("it is there, but no library that can be loaded", "Check the file and the right to read it")
+            return what.format(named), advice.format(named)
+    return "", ""
 
 
 def of_port(url: str, problem: BaseException) -> str:
     """What to do about a port that does not open."""
-    number = getattr(problem, "errno", None) or getattr(problem.__context__, "errno", None)
+    number, group = getattr(problem, "errno", None) or getattr(problem.__context__, "errno", None), "root"
     if number in (errno.EACCES, errno.EPERM) and os.name == "posix":
-        return _right_to(Path(url))
+        with suppress(OSError, KeyError):  # a group without a name
+            group = Path(url).group() if Path(url).stat().st_mode & 0o060 == 0o060 else group
+        if group == "root":
+            return (
+                "This account has no right to it: ask for a udev rule that gives it to a group of yours (GROUP, MODE)"
+            )
+        return f"It belongs to the group {group}: `sudo usermod -aG {group} $USER`, then log out and in"
     if number in (errno.EBUSY, errno.EAGAIN) or "PermissionError(13" in str(problem):
-        return f"Another program holds it, which `fuser {url}` names on Linux: close that"
+        return f"Another program holds it (on Linux, `fuser {url}` names it): close that"
     if number == errno.ECONNREFUSED:
         return "Nothing listens there, or the server takes no further client: check the port's number, close others"
     return "Check the cable, the port's name in the configuration and that no other program holds it"
 
 
-def _right_to(port: Path) -> str:
-    """How an account gets the right to a port that it may not open (POSIX)."""
-    group, allowed = "", 0
-    with suppress(OSError, KeyError):  # a group without a name
-        allowed, group = port.stat().st_mode & 0o060, port.group()
-    if allowed == 0o060 and group not in ("", "root"):
-        return f"It belongs to the group {group}: `sudo usermod -aG {group} $USER`, then log out and in"
-    return "This account has no right to it: ask for a udev rule that gives it to a group of yours (MODE, GROUP)"
-
-
-NO_TEXT = re.compile(r"[^\t\n\r -~]")
-"""A character that no text of a device has."""
-TELNET = Cause(
-    "the server speaks Telnet (FF and FA to FE begin its negotiation)",
-    "Set this port of the terminal server to raw TCP: no Telnet, no RFC 2217",
-)
-_FOREIGN: tuple[tuple[str, Cause], ...] = (
-    (r"\xff[\xf0-\xfe]", TELNET),
+NO_TEXT = re.compile(r"[^\t\n\r -~]")  # a character that no text of a device has
+_FOREIGN = (  # searched in the URL, a line end, and what was heard
     (
-        r"(?i)\b(login|username|user name|password) ?:",
-        Cause("a login is asked for", "Set this port of the terminal server to raw TCP, without a login"),
+        r"^socket:.*\xff[\xf0-\xfe]",  # on a serial line it is noise
+        "the server speaks Telnet (FF begins its negotiation)",
+        "Set this port of the terminal server to raw TCP: no Telnet, no RFC 2217",
     ),
     (
-        r"(?i)HTTP/\d|<html|SSH-\d",
-        Cause("a web or SSH server answers", "Give the number of the port that leads to the serial line"),
+        r"\b(login|user ?name|password) ?:",
+        "a login is asked for",
+        "Set this port of the terminal server to raw TCP, without a login",
     ),
     (
-        r"(?i)(already|port|line)( is)? in use|\bport \S*(is )?busy|too many (clients|connections|sessions)",
-        Cause("another client holds the server's port", "Close the other program, or allow a second client"),
+        r"HTTP/\d|<html|SSH-\d",
+        "a web or SSH server answers",
+        "Give the number of the port that leads to the serial line",
     ),
     (
-        NO_TEXT.pattern,
-        Cause("it has bytes that are no text", "Check baud rate and cable, and that the device speaks text"),
+        r"already in use|(port|line) is (in use|busy)|too many (clients|connections|sessions)",
+        "another client holds the server's port",
+        "Close the other program, or let the server take a second client",
+    ),
+    (
+        rf"\n.*{NO_TEXT.pattern}",
+        "it has bytes that are no text",
+        "Check the baud rate, the cable, and that the device is set to speak text",
     ),
 )
 
 
-def of_bytes(url: str, heard: str) -> Cause:
-    """Who speaks on a line that a device should speak on, by what was heard there (bytes as Latin-1)."""
-    rows = _FOREIGN if url.lower().startswith("socket:") else _FOREIGN[1:]  # on a serial line it is noise
-    return next((cause for said, cause in rows if re.search(said, heard)), Cause())
+def of_bytes(url: str, heard: str) -> tuple[str, str]:
+    """Who speaks on a line in the place of its device, by what was heard (a character a byte), and what to do."""
+    words = f"{url}\n{heard}"
+    return next((row[1:] for row in _FOREIGN if re.search(row[0], words, re.IGNORECASE | re.DOTALL)), ("", ""))

@@ -4,14 +4,12 @@ from drivers.base.errors import DeviceError
 
 try:
     import serial as serial
-    from serial.tools import list_ports as list_ports
-
-    serial.serial_for_url  # noqa: B018 - the package `serial` writes over parts of pyserial alone
-except (ImportError, AttributeError) as problem:
+    from serial import serial_for_url as serial_for_url  # the package `serial` overwrites a part of pyserial
+except ImportError as problem:
     raise DeviceError(
         "serial ports",
         f"the module `serial` is not that of pyserial ({problem})",
-        advice="PyPI's package `serial` has taken its place, or a serial.py or folder of yours has: rename yours, or "
-        "`pip uninstall serial`, then `pip install --force-reinstall pyserial`",
+        advice="PyPI's package `serial` has taken its place: `pip uninstall serial`, then `pip install "
+        "--force-reinstall pyserial`. If it is a serial.py or folder of yours, rename that",
         state="Nothing was sent",
     ) from problem

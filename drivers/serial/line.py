@@ -18,10 +18,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from drivers.base.causes import NO_TEXT, TELNET, of_bytes, of_port
+import serial
+from serial.tools import list_ports
+
+from drivers.base.causes import NO_TEXT, of_bytes, of_port
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial import list_ports, serial
 from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, Transcript, readable
 
 
@@ -42,7 +44,7 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
         OSError, ValueError: it does not open.
     """
     port = serial.serial_for_url(url, baudrate=baudrate, timeout=quiet, write_timeout=write_timeout, exclusive=True)
-    if _is_socket(url):
+    if url.lower().startswith("socket://"):
         # Send each request at once: Nagle's algorithm, which gathers small packets, costs 40 to 200 ms for every
         # command and its read-back.
         with contextlib.suppress(OSError), socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as copy:
@@ -50,11 +52,7 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
     return port
 
 
-def _is_socket(url: str) -> bool:
-    return url.lower().startswith("socket:")
-
-
-_OTHER_CLIENT = "Many terminal servers serve one client: another program may hold this port of it"
+_OTHER_CLIENT = ". Many terminal servers serve one client: another program may hold this port"
 _CLOSED = (
     "Let the server keep a connection without traffic (idle time 0), and see that no other client takes its port. Then "
     "start again"
@@ -119,9 +117,9 @@ class SerialLine:
         transcript: Path | None = None,
     ) -> None:
         self._device, self._probe, self._clock, self._timeout = device, rules.probe, clock, timeout
-        self._url, self._rules, self._has_answered = url, rules, False
+        self._url, self._rules, self._socket = url, rules, url.lower().startswith("socket:")
         self._asking, self._writing = threading.RLock(), threading.Lock()
-        self._in_step, self._closed = True, False
+        self._in_step, self._closed, self._has_answered = True, False, False
         self._answered = "", NEVER  # the last request that was answered, and the form of its reply
         if not 0 < timeout < math.inf:
             raise DeviceRefused(
@@ -183,17 +181,14 @@ class SerialLine:
                 if not self._in_step:
                     self._resynchronise(request, state)
                 self._in_step = False
-                for line in self._reader.discard_lines(whole_only=self._has_answered or not _is_socket(self._url)):
+                for line in self._reader.discard_lines():
                     self._refuse_second_reply(line, state)
                 self._write(data, request)
                 text = self._reader.reply(self._clock.now() + self._timeout)
-            if (
-                isinstance(text, str)
-                and (match := re.fullmatch(reply, text)) is not None
-                and not self._is_foreign(text, to_bytes=isinstance(command, bytes))
-            ):
-                self._in_step = self._has_answered = True
-                self._reader.heard = ""
+            match = re.fullmatch(reply, text) if isinstance(text, str) else None
+            words = self._rules.text and isinstance(command, str)  # a control byte may be answered by another one
+            if match is not None and not (words and NO_TEXT.search(match[0])):
+                self._in_step, self._has_answered, self._reader.heard = True, True, ""
                 self._answered = (request, reply) if self._rules.identified else self._answered
                 return match
             if isinstance(text, str):
@@ -202,6 +197,7 @@ class SerialLine:
             if text is None:
                 problem, received = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
                 advice = "Check power, cable and baud rate; the next request first brings the line into step again"
+                advice += _OTHER_CLIENT if self._socket else ""
             elif isinstance(text, Damaged):
                 problem, received = f"the reply was damaged on the way: {text.why}", text.text
                 advice = "Check the cable, its shield and the baud rate"
@@ -297,16 +293,15 @@ class SerialLine:
                 state=state,
             ) from problem
         except OSError as error:
-            failure, advice = f"{error}", "Check that the cable or adapter is still plugged in, then start again"
-            if _is_socket(self._url):
-                failure += f"; the other side closed the connection, {self._reader.silence:.1f} s after its last byte"
-                advice = _CLOSED
             raise self._error(
                 DeviceError,
-                f"the port failed: {failure}",
+                f"the port failed: {error}{'; the other side closed the connection' if self._socket else ''}",
                 request=request,
                 expected="a port that stays open",
-                advice=advice,
+                advice=_CLOSED
+                if self._socket
+                else "Check that the cable or adapter is still plugged in, then start again. "
+                f"Serial ports of this computer: {serial_ports()}",
                 state=state,
             ) from error
 
@@ -317,23 +312,12 @@ class SerialLine:
                 self._device, "it was closed", request=request, advice="Open it again", state="Nothing was sent"
             )
 
-    def _is_foreign(self, text: str, *, to_bytes: bool) -> bool:
-        """Whether a reply of the right form is none, since others speak on this line. `to_bytes`: it answers a control
-        byte, perhaps by one.
-        """
-        strange = self._rules.text and not to_bytes and NO_TEXT.search(text) is not None
-        return strange or of_bytes(self._url, self._reader.heard) is TELNET
-
-    def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
-        """The error, with its cause where the bytes since the last good reply show it."""
+    def _error(self, kind: type[DeviceError], problem: str, *, advice: str, **parts: str) -> DeviceError:
+        """The error, with its cause where the bytes since the last good reply show one."""
         cause, todo = of_bytes(self._url, self._reader.heard)
-        advice = [todo or parts.pop("advice")]
-        if not self._has_answered:
-            silent = _is_socket(self._url) and not self._reader.heard
-            advice += [_OTHER_CLIENT if silent else "", self._rules.unanswered]
-        problem = f"{problem}: {cause}" if cause else problem
-        parts["advice"] = ". ".join(filter(None, advice))
-        return kind(self._device, problem, wire=self._transcript.recent(), **parts)
+        hint = "" if self._has_answered or not self._rules.unanswered else f". {self._rules.unanswered}"
+        problem, wire = f"{problem}{cause and ': '}{cause}", self._transcript.recent()
+        return kind(self._device, problem, advice=(todo or advice) + hint, wire=wire, **parts)
 
 
 class LineSettings(Protocol):

@@ -134,12 +134,6 @@ class LineReader:
         self._received = bytearray()
         self.heard = ""
         """The last of what has come; whoever reads sets it to "" where all of it was understood."""
-        self._heard_at = clock.now()
-
-    @property
-    def silence(self) -> float:
-        """s since the last byte."""
-        return self._clock.now() - self._heard_at
 
     @property
     def incomplete(self) -> str:
@@ -184,27 +178,25 @@ class LineReader:
                 return False
         return True
 
-    def discard_lines(self, *, whole_only: bool) -> list[str]:
+    def discard_lines(self) -> list[str]:
         """Discard the complete lines received so far, and return them: they cannot be the reply to a request not yet
         sent.
 
-        The rest stays where `whole_only`: it may be the beginning of an unsolicited line.
+        The rest stays: it may be the beginning of an unsolicited line.
         """
         while len(self._received) <= LONGEST_LINE and self._port.in_waiting:
             self._received += self._read()
         old, end, rest = bytes(self._received).rpartition(self._framing.line_end)
         if end:
             self._transcript.add_line("!", f"discarded {readable(old)}")
-        if end or not whole_only:
-            self._received = bytearray(rest if whole_only else b"")
+            self._received = bytearray(rest)
         return [readable(line) for line in old.split(self._framing.line_end)] if end else []
 
     def _read(self) -> bytes:
         """The bytes that have arrived (over TCP one of them), or the first to arrive; b"" if the line stays silent."""
         data = bytes(self._port.read(max(1, int(self._port.in_waiting))))
         self._transcript.log_bytes("<", data)
-        if data:
-            self.heard, self._heard_at = (self.heard + readable(data))[-LONGEST_LINE:], self._clock.now()
+        self.heard = (self.heard + readable(data))[-LONGEST_LINE:]
         return data
 
 
