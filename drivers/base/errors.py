@@ -38,7 +38,7 @@ class DeviceError(Exception):
         self.expected, self.advice, self.state, self.wire = expected, advice, state, wire
         formatted = (
             ("Asked {!r}", request),
-            ("Answered {!a}", reply),
+            ("Answered {!r}", reply),
             ("Expected {}", expected),
             ("{}", advice),
             ("{}", state),

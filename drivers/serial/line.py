@@ -204,6 +204,7 @@ class SerialLine:
             else:
                 problem, received = "the reply does not have the form it must have", text
                 advice = "The line may be disturbed, or the device may be another model"
+            received = received.encode("latin-1").decode("ascii", "backslashreplace")
             raise self._error(
                 kind, problem, request=request, reply=received, expected=meaning, advice=advice, state=state
             )
