@@ -157,8 +157,8 @@ def guard_streams() -> None:
     both, and stdin, are open from now on.
 
     The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
-    What a library of others prints to stdout, also at the end of the process, goes to stderr: a line of it in `--json`
-    is no JSON.
+    What a library of others prints to stdout, also at the end of the process, goes to stderr, and nowhere with
+    `--json`: a line of it is no JSON.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         os.set_inheritable(number, True)
@@ -166,7 +166,7 @@ def guard_streams() -> None:
     streams: Any = sys  # typeshed knows text files alone
     if getattr(out := sys.stdout or _nowhere(), "name", "") == "<stdout>":  # and not what a host put there
         out = open(os.dup(1), "w", encoding=out.encoding, errors=out.errors, buffering=1 if out.isatty() else -1)  # noqa: PTH123, SIM115
-        os.dup2(2, 1)
+        os.dup2(os.open(os.devnull, os.O_WRONLY) if "--json" in sys.argv else 2, 1)
     streams.stdout = _Printable(_Lasting(out))
     streams.stderr = _Printable(_Lasting(sys.stderr or _nowhere()))
 

@@ -130,7 +130,7 @@ def installed_library(platform: str) -> str:
     return "dcamapi.dll" if platform == "win32" else "libdcamapi.so"
 
 
-STARTS_WITHIN = 30.0  # s for the library to look for cameras; some seconds are usual
+STARTS_WITHIN = 20.0  # s for the library to look for cameras; some seconds are usual
 _SURVIVED = 86  # exit code of a trial whose library has loaded and started, or has said why not
 _TRIAL = f"""
 import ctypes, os, sys
