@@ -165,8 +165,9 @@ def guard_streams() -> None:
     os.close(number)
     streams: Any = sys  # typeshed knows text files alone
     if getattr(out := sys.stdout or _nowhere(), "name", "") == "<stdout>":  # and not what a host put there
-        line_by_line = 1 if out.isatty() else -1
-        out = open(os.dup(1), "w", line_by_line, out.encoding, out.errors, closefd=False)  # noqa: PTH123, SIM115
+        out = open(  # noqa: SIM115
+            os.dup(1), "w", 1 if out.isatty() else -1, out.encoding, out.errors, closefd=False
+        )
         os.dup2(os.open(os.devnull, os.O_WRONLY) if "--json" in sys.argv else 2, 1)
     streams.stdout = _Printable(_Lasting(out))
     streams.stderr = _Printable(_Lasting(sys.stderr or _nowhere()))

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import serial
 from serial.tools import list_ports
@@ -52,11 +52,8 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
     return port
 
 
-_OTHER_CLIENT = ". Many terminal servers serve one client: another program may hold this port"
-_CLOSED = (
-    "Let the server keep a connection without traffic (idle time 0), and see that no other client takes its port. Then "
-    "start again"
-)
+_SILENT = "Check power, cable and baud rate; the next request first brings the line into step again"
+_SERVER = ". Many terminal servers serve one client: another program may hold this port"
 NEVER = r"(?!)"  # A form that no line has
 QUIET = 0.05  # s without a byte after which a line counts as silent
 
@@ -79,7 +76,7 @@ class LineRules:
         identified: each reply has the number of its request, so that a second one comes from another device.
         check: returns the fault of a received line, "" if it is good; for checksums.
         text: no reply has control characters or bytes above 7F; one that has them is refused, whatever its form.
-        unanswered: what else to do about a device that has never answered.
+        unanswered: further sentences of advice on a device that has never answered.
     """
 
     probe: Probe
@@ -193,20 +190,23 @@ class SerialLine:
                 return match
             if isinstance(text, str):
                 self._refuse_second_reply(text, state)
-            kind = DeviceTimeout if text is None else DeviceError
             if text is None:
-                problem, received = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
-                advice = "Check power, cable and baud rate; the next request first brings the line into step again"
-                advice += _OTHER_CLIENT if self._socket else ""
+                what, received = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
+                advice = _SILENT + (_SERVER if self._socket else "")
             elif isinstance(text, Damaged):
-                problem, received = f"the reply was damaged on the way: {text.why}", text.text
+                what, received = f"the reply was damaged on the way: {text.why}", text.text
                 advice = "Check the cable, its shield and the baud rate"
             else:
-                problem, received = "the reply does not have the form it must have", text
+                what, received = "the reply does not have the form it must have", text
                 advice = "The line may be disturbed, or the device may be another model"
-            received = received.encode("latin-1").decode("ascii", "backslashreplace")
             raise self._error(
-                kind, problem, request=request, reply=received, expected=meaning, advice=advice, state=state
+                DeviceTimeout if text is None else DeviceError,
+                what,
+                request=request,
+                reply=received.encode("latin-1").decode("ascii", "backslashreplace"),
+                expected=meaning,
+                advice=advice,
+                state=state,
             )
 
     def close(self) -> None:
@@ -299,7 +299,8 @@ class SerialLine:
                 f"the port failed: {error}{'; the other side closed the connection' if self._socket else ''}",
                 request=request,
                 expected="a port that stays open",
-                advice=_CLOSED
+                advice="Let the server keep a connection without traffic (idle time 0), and see that no other client "
+                "takes its port. Then start again"
                 if self._socket
                 else "Check that the cable or adapter is still plugged in, then start again. "
                 f"Serial ports of this computer: {serial_ports()}",
@@ -316,27 +317,24 @@ class SerialLine:
     def _error(self, kind: type[DeviceError], problem: str, *, advice: str, **parts: str) -> DeviceError:
         """The error, with its cause where the bytes since the last good reply show one."""
         cause, todo = of_bytes(self._url, self._reader.heard)
-        hint = "" if self._has_answered or not self._rules.unanswered else f". {self._rules.unanswered}"
-        problem, wire = f"{problem}{cause and ': '}{cause}", self._transcript.recent()
-        return kind(self._device, problem, advice=(todo or advice) + hint, wire=wire, **parts)
+        advice = (todo or advice) + ("" if self._has_answered else self._rules.unanswered)
+        wire = self._transcript.recent()
+        return kind(self._device, f"{problem}{cause and ': '}{cause}", advice=advice, wire=wire, **parts)
 
 
-class LineSettings(Protocol):
-    """Settings of a line: the timeout of a reply in s, the baud rate, and the file of its bytes, if any."""
+def line_to(wiring: Any, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
+    """Open the line to the controller of the stage `name`.
 
-    @property
-    def timeout(self) -> float: ...
-    @property
-    def baudrate(self) -> int: ...
-    @property
-    def transcript(self) -> Path | None: ...
-
-
-def line_to(wiring: LineSettings, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
-    """Open the line to the controller of the stage `name`; `rules` as in `LineRules`."""
-    connection: dict[str, Any] = {
-        "timeout": wiring.timeout,
-        "baudrate": wiring.baudrate,
-        "transcript": wiring.transcript,
-    }
-    return SerialLine(url, LineRules(probe, **rules), clock, device=name, **connection)
+    Args:
+        wiring: settings of a stage, with `timeout`, `baudrate` and `transcript`.
+        rules: as in `LineRules`.
+    """
+    return SerialLine(
+        url,
+        LineRules(probe, **rules),
+        clock,
+        device=name,
+        timeout=wiring.timeout,
+        baudrate=wiring.baudrate,
+        transcript=wiring.transcript,
+    )

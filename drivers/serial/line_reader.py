@@ -132,8 +132,7 @@ class LineReader:
         self._port, self._clock, self._transcript = port, clock, transcript
         self._framing, self._unsolicited, self._check = framing, re.compile(unsolicited), check
         self._received = bytearray()
-        self.heard = ""
-        """The last of what has come; whoever reads sets it to "" where all of it was understood."""
+        self.heard = ""  # the last of what has come; whoever reads empties it where all was understood
 
     @property
     def incomplete(self) -> str:

@@ -168,8 +168,8 @@ TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
 """Most digits of a position; a longer number is impossible for an axis and for a float."""
 CHECKSUM = "comm.checksum"
 BINARY = (
-    "A device that is set to Zaber's Binary protocol (usually at 9600 baud) does not understand ASCII: switch it with "
-    "Zaber Launcher, or by the Binary command 124 (Convert To ASCII)"
+    ". A device that is set to Zaber's Binary protocol (usually at 9600 baud) does not understand ASCII: switch it "
+    "with Zaber Launcher, or by the Binary command 124 (Convert To ASCII)"
 )
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
 """Settings of the axis that survive a power cycle; the driver restores them, and the device's checksums, at the end."""
