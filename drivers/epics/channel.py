@@ -79,7 +79,7 @@ def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
         raise DeviceError(
             device,
             f"{url} needs the library {library}, which cannot be loaded here ({error})",
-            advice='pip install --force-reinstall "splatline[epics]"',
+            advice='pip install "splatline[epics]"',
             state="Nothing was asked",
         ) from error
 
