@@ -24,7 +24,7 @@ from serial.tools import list_ports
 from drivers.base.causes import NO_TEXT, of_bytes, of_port
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, Transcript, readable
+from drivers.serial.line_reader import CRLF, RECENT_LINES, Damaged, Framing, LineReader, Transcript, readable
 
 
 def serial_ports() -> str:
@@ -184,12 +184,16 @@ class SerialLine:
                 text = self._reader.reply(self._clock.now() + self._timeout)
             match = re.fullmatch(reply, text) if isinstance(text, str) else None
             words = self._rules.text and isinstance(command, str)  # a control byte may be answered by another one
-            if match is not None and not (words and NO_TEXT.search(match[0])):
+            heard = self._reader.heard if self._socket else text  # a server's negotiation may have been discarded
+            if match is not None and not (words and NO_TEXT.search(str(heard))):
                 self._in_step, self._has_answered, self._reader.heard = True, True, ""
                 self._answered = (request, reply) if self._rules.identified else self._answered
                 return match
             if isinstance(text, str):
                 self._refuse_second_reply(text, state)
+            with contextlib.suppress(OSError):
+                for _ in range(RECENT_LINES if self._socket else 0):  # what else a server says tells what it is
+                    self._reader.line(self._clock.now() + QUIET)
             if text is None:
                 what, received = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
                 advice = _SILENT + (_SERVER if self._socket else "")
