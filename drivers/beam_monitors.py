@@ -72,7 +72,7 @@ class SerialSource:
             raise DeviceRefused(name, "the query is empty", state="Nothing was sent")
         self._line = SerialLine(
             url,
-            LineRules(Probe(self.request, self._form), framing=Framing(reading.line_end, reading.line_end)),
+            LineRules(Probe(self.request, self._form), framing=Framing(reading.line_end, reading.line_end), text=False),
             clock,
             device=name,
             timeout=timeout,

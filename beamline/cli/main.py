@@ -157,12 +157,19 @@ def guard_streams() -> None:
     both, and stdin, are open from now on.
 
     The next file to be opened would get the number of a closed one (`>&-`): a scan file would receive printed text.
+    What a library of others prints to stdout, also at the end of the process, goes to stderr, and nowhere with
+    `--json`: a line of it is no JSON.
     """
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         os.set_inheritable(number, True)
     os.close(number)
     streams: Any = sys  # typeshed knows text files alone
-    streams.stdout = _Printable(_Lasting(sys.stdout or _nowhere()))
+    if getattr(out := sys.stdout or _nowhere(), "name", "") == "<stdout>":  # and not what a host put there
+        out = open(  # noqa: SIM115
+            os.dup(1), "w", 1 if out.isatty() else -1, out.encoding, out.errors, closefd=False
+        )
+        os.dup2(os.open(os.devnull, os.O_WRONLY) if "--json" in sys.argv else 2, 1)
+    streams.stdout = _Printable(_Lasting(out))
     streams.stderr = _Printable(_Lasting(sys.stderr or _nowhere()))
 
 

@@ -21,6 +21,7 @@ def port_problem(port: str) -> str:
     return f"{port} is no port; expected one such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
 
 
+SEVERAL_LINES = ("description", "pattern", "query", "line_end")  # keys whose text may have control characters
 Port = Annotated[str, Setting(min_length=1, problem=port_problem)]
 
 
@@ -34,12 +35,17 @@ class Section(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _no_truth_for_numbers(cls, data: Any) -> Any:
-        for name, field in cls.model_fields.items():
-            truths = field.annotation, *get_args(field.annotation)
-            if isinstance(data, dict) and isinstance(data.get(name), bool) and bool not in truths:
-                value = str(data[name]).lower()
-                raise ValueError(f"{name} is {value} (YAML reads yes, no, on and off as true and false)")
+    def _as_meant(cls, data: Any) -> Any:
+        """Refuse what YAML reads otherwise than it was meant."""
+        for name, field in cls.model_fields.items() if isinstance(data, dict) else ():
+            truths, value = (field.annotation, *get_args(field.annotation)), data.get(name)
+            if isinstance(value, bool) and bool not in truths:
+                raise ValueError(f"{name} is {str(value).lower()} (YAML reads yes, no, on and off as true and false)")
+            if isinstance(value, str) and name not in SEVERAL_LINES and (found := min(value, default=" ")) < " ":
+                raise ValueError(
+                    f"{name} is {value!r}, with the control character {found!r}: within double quotes a backslash "
+                    "begins one; write the text without quotes, or within single ones"
+                )
         return data
 
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import ctypes
+import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int32, c_void_p, sizeof
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from drivers.base.causes import of_library
 from drivers.base.errors import DeviceError
 from drivers.dcam.codes import (
     ApiInit,
@@ -126,6 +130,58 @@ def installed_library(platform: str) -> str:
     return "dcamapi.dll" if platform == "win32" else "libdcamapi.so"
 
 
+STARTS_WITHIN = 20.0  # s for the library to look for cameras; some seconds are usual
+_SURVIVED = 86  # exit code of a trial whose library has loaded and started, or has said why not
+_TRIAL = f"""
+import ctypes, os, sys
+try:
+    library = ctypes.CDLL(sys.argv[1], mode=ctypes.RTLD_GLOBAL, winmode=0)
+    library.dcamapi_init(ctypes.create_string_buffer(bytes.fromhex(sys.argv[2])))
+    library.dcamapi_uninit()
+except (OSError, AttributeError):
+    pass
+os._exit({_SURVIVED})
+"""
+
+
+@cache
+def try_out(name: str, device: str) -> None:
+    """Load and start a library in a process of its own, once a process of ours, in which it may hang or crash.
+
+    A program that contains its Python, and so cannot start another one, goes without this.
+
+    Raises:
+        DeviceError: it does not return, or ends that process.
+    """
+    if "python" not in Path(sys.executable or "").name.lower():
+        return
+    process = subprocess.Popen(
+        [sys.executable, "-P", "-S", "-c", _TRIAL, name, bytes(ApiInit(size=sizeof(ApiInit))).hex()],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C is for us
+        creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+    )
+    try:
+        *_, last = process.communicate(timeout=STARTS_WITHIN)[1].decode(errors="replace").splitlines() or [""]
+        if process.returncode == _SURVIVED:
+            return
+        how = f"ends the process that starts it (code {process.returncode}{last and ', '}{last})"
+    except subprocess.TimeoutExpired:
+        how = f"does not return from its start within {STARTS_WITHIN:g} s"
+        process.kill()
+        with suppress(subprocess.TimeoutExpired):  # one that hangs in its driver cannot even be killed
+            process.communicate(timeout=1)
+    raise DeviceError(
+        device,
+        f"the camera's library {name} {how}",
+        advice="End other programs that use the camera, and switch it off and on. If it stays, install the vendor's "
+        "DCAM-API runtime anew, with the modules and drivers of this camera's interface alone",
+        state="It was tried in a process of its own, and nothing was changed",
+    )
+
+
 class Dcam:
     """A loaded DCAM library. Handles are plain integers; every method raises DcamError if the library returns an error.
 
@@ -142,13 +198,15 @@ class Dcam:
     def __init__(self, library: Path | None, device: str) -> None:
         self._device = device
         name = str(library or installed_library(sys.platform))
+        try_out(name, device)
         try:
             # RTLD_GLOBAL: the camera modules that the library loads resolve their symbols from it.
             # winmode 0: the full Windows search path, where the vendor's runtime installs itself.
             loaded = ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL, winmode=0)
         except OSError as error:
-            problem = f"the camera's library {name} cannot be loaded ({error})"
-            advice = "Install the vendor's DCAM-API runtime, or give the library's path in the configuration"
+            cause, todo = of_library(name, error)
+            problem = f"the camera's library {name} cannot be loaded{cause and ': '}{cause} ({error})"
+            advice = todo or "Install the vendor's DCAM-API runtime, or give the library's path in the configuration"
             raise DeviceError(device, problem, advice=advice, state="Nothing was changed") from error
         missing = [call for call in ARGUMENTS if getattr(loaded, call, None) is None]
         if missing:

@@ -74,10 +74,11 @@ def open_channel(url: str, device: str, timeout: float) -> ProcessVariable:
     scheme, _, name = url.partition("://")
     try:
         return OPENERS[scheme.lower()](name, device, timeout)
-    except ImportError as error:
+    except (ImportError, OSError, ValueError) as error:  # ValueError: it was compiled for another numpy
+        library = getattr(error, "name", None) or f"for {scheme}://"
         raise DeviceError(
             device,
-            f"{url} needs the library {error.name}, which cannot be loaded here ({error})",
+            f"{url} needs the library {library}, which cannot be loaded here ({error})",
             advice='pip install "splatline[epics]"',
             state="Nothing was asked",
         ) from error

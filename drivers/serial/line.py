@@ -16,14 +16,15 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import serial
 from serial.tools import list_ports
 
+from drivers.base.causes import NO_TEXT, of_bytes, of_port
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
-from drivers.serial.line_reader import CRLF, Damaged, Framing, LineReader, Transcript, readable
+from drivers.serial.line_reader import CRLF, RECENT_LINES, Damaged, Framing, LineReader, Transcript, readable
 
 
 def serial_ports() -> str:
@@ -48,10 +49,11 @@ def open_port(url: str, baudrate: int, quiet: float, write_timeout: float) -> An
         # command and its read-back.
         with contextlib.suppress(OSError), socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as copy:
             copy.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            port.reset_input_buffer()  # other kinds of port do this at opening
     return port
 
 
+_SILENT = "Check power, cable and baud rate; the next request first brings the line into step again"
+_SERVER = ". Many terminal servers serve one client: another program may hold this port"
 NEVER = r"(?!)"  # A form that no line has
 QUIET = 0.05  # s without a byte after which a line counts as silent
 
@@ -73,6 +75,8 @@ class LineRules:
             recorded.
         identified: each reply has the number of its request, so that a second one comes from another device.
         check: returns the fault of a received line, "" if it is good; for checksums.
+        text: no reply has control characters or bytes above 7F; one that has them is refused, whatever its form.
+        unanswered: further sentences of advice on a device that has never answered.
     """
 
     probe: Probe
@@ -80,6 +84,8 @@ class LineRules:
     framing: Framing = CRLF
     identified: bool = False
     check: Callable[[str], str] = lambda line: ""
+    text: bool = True
+    unanswered: str = ""
 
 
 class SerialLine:
@@ -108,9 +114,9 @@ class SerialLine:
         transcript: Path | None = None,
     ) -> None:
         self._device, self._probe, self._clock, self._timeout = device, rules.probe, clock, timeout
+        self._url, self._rules, self._socket = url, rules, url.lower().startswith("socket:")
         self._asking, self._writing = threading.RLock(), threading.Lock()
-        self._framing, self._in_step, self._closed = rules.framing, True, False
-        self._identified = rules.identified
+        self._in_step, self._closed, self._has_answered = True, False, False
         self._answered = "", NEVER  # the last request that was answered, and the form of its reply
         if not 0 < timeout < math.inf:
             raise DeviceRefused(
@@ -138,8 +144,7 @@ class SerialLine:
                 device,
                 f"the port {url!r} does not open: {problem}",
                 expected="a port like /dev/ttyUSB0, COM3, socket://host:port or sim://pm16c",
-                advice="Check the cable, the port's name in the configuration and that no other program holds it. "
-                f"Serial ports of this computer: {serial_ports()}",
+                advice=f"{of_port(url, problem)}. Serial ports of this computer: {serial_ports()}",
                 state="Nothing was sent",
             ) from problem
         self._reader = LineReader(self._port, clock, self._transcript, rules.framing, rules.unsolicited, rules.check)
@@ -177,24 +182,35 @@ class SerialLine:
                     self._refuse_second_reply(line, state)
                 self._write(data, request)
                 text = self._reader.reply(self._clock.now() + self._timeout)
-            if isinstance(text, str) and (match := re.fullmatch(reply, text)) is not None:
-                self._in_step = True
-                self._answered = (request, reply) if self._identified else self._answered
+            match = re.fullmatch(reply, text) if isinstance(text, str) else None
+            words = self._rules.text and isinstance(command, str)  # a control byte may be answered by another one
+            heard = self._reader.heard if self._socket else text  # a server's negotiation may have been discarded
+            if match is not None and not (words and NO_TEXT.search(str(heard))):
+                self._in_step, self._has_answered, self._reader.heard = True, True, ""
+                self._answered = (request, reply) if self._rules.identified else self._answered
                 return match
             if isinstance(text, str):
                 self._refuse_second_reply(text, state)
-            kind = DeviceTimeout if text is None else DeviceError
+            with contextlib.suppress(OSError):
+                for _ in range(RECENT_LINES if self._socket else 0):  # what else a server says tells what it is
+                    self._reader.line(self._clock.now() + QUIET)
             if text is None:
-                problem, received = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
-                advice = "Check power, cable and baud rate; the next request first brings the line into step again"
+                what, received = f"no whole reply within {self._timeout:g} s", self._reader.incomplete[:80]
+                advice = _SILENT + (_SERVER if self._socket else "")
             elif isinstance(text, Damaged):
-                problem, received = f"the reply was damaged on the way: {text.why}", text.text
+                what, received = f"the reply was damaged on the way: {text.why}", text.text
                 advice = "Check the cable, its shield and the baud rate"
             else:
-                problem, received = "the reply does not have the form it must have", text
+                what, received = "the reply does not have the form it must have", text
                 advice = "The line may be disturbed, or the device may be another model"
             raise self._error(
-                kind, problem, request=request, reply=received, expected=meaning, advice=advice, state=state
+                DeviceTimeout if text is None else DeviceError,
+                what,
+                request=request,
+                reply=received.encode("latin-1").decode("ascii", "backslashreplace"),
+                expected=meaning,
+                advice=advice,
+                state=state,
             )
 
     def close(self) -> None:
@@ -209,7 +225,7 @@ class SerialLine:
         """The bytes to send, and their text for messages."""
         if isinstance(command, bytes):
             return command, readable(command)
-        return command.encode("ascii") + self._framing.command_end, command or "an empty line"
+        return command.encode("ascii") + self._rules.framing.command_end, command or "an empty line"
 
     def _resynchronise(self, request: str, state: str) -> None:
         """Discard what arrives, send the probe, skip late replies until its own, and wait for silence."""
@@ -230,7 +246,7 @@ class SerialLine:
                 state=state,
             )
         self._wait_for_quiet(request, state)
-        self._in_step = True
+        self._in_step, self._reader.heard = True, ""
         self._transcript.add_line("!", "in step again")
 
     def _refuse_second_reply(self, line: str, state: str) -> None:
@@ -281,15 +297,19 @@ class SerialLine:
                 advice="Check power, cable and flow control (none is expected)",
                 state=state,
             ) from problem
-        except OSError as problem:
+        except OSError as error:
             raise self._error(
                 DeviceError,
-                f"the port failed: {problem}",
+                f"the port failed: {error}{'; the other side closed the connection' if self._socket else ''}",
                 request=request,
                 expected="a port that stays open",
-                advice="Check that the cable or adapter is still plugged in, then start again",
+                advice="Let the server keep a connection without traffic (idle time 0), and see that no other client "
+                "takes its port. Then start again"
+                if self._socket
+                else "Check that the cable or adapter is still plugged in, then start again. "
+                f"Serial ports of this computer: {serial_ports()}",
                 state=state,
-            ) from problem
+            ) from error
 
     def _refuse_if_closed(self, request: str) -> None:
         """Raise DeviceError if the line is closed: operating systems raise different errors for a closed port."""
@@ -298,26 +318,27 @@ class SerialLine:
                 self._device, "it was closed", request=request, advice="Open it again", state="Nothing was sent"
             )
 
-    def _error(self, kind: type[DeviceError], problem: str, **parts: str) -> DeviceError:
-        return kind(self._device, problem, wire=self._transcript.recent(), **parts)
+    def _error(self, kind: type[DeviceError], problem: str, *, advice: str, **parts: str) -> DeviceError:
+        """The error, with its cause where the bytes since the last good reply show one."""
+        cause, todo = of_bytes(self._url, self._reader.heard)
+        advice = (todo or advice) + ("" if self._has_answered else self._rules.unanswered)
+        wire = self._transcript.recent()
+        return kind(self._device, f"{problem}{cause and ': '}{cause}", advice=advice, wire=wire, **parts)
 
 
-class LineSettings(Protocol):
-    """Settings of a line: the timeout of a reply in s, the baud rate, and the file of its bytes, if any."""
+def line_to(wiring: Any, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
+    """Open the line to the controller of the stage `name`.
 
-    @property
-    def timeout(self) -> float: ...
-    @property
-    def baudrate(self) -> int: ...
-    @property
-    def transcript(self) -> Path | None: ...
-
-
-def line_to(wiring: LineSettings, url: str, name: str, clock: Clock, probe: Probe, **rules: Any) -> SerialLine:
-    """Open the line to the controller of the stage `name`; `rules` as in `LineRules`."""
-    connection: dict[str, Any] = {
-        "timeout": wiring.timeout,
-        "baudrate": wiring.baudrate,
-        "transcript": wiring.transcript,
-    }
-    return SerialLine(url, LineRules(probe, **rules), clock, device=name, **connection)
+    Args:
+        wiring: settings of a stage, with `timeout`, `baudrate` and `transcript`.
+        rules: as in `LineRules`.
+    """
+    return SerialLine(
+        url,
+        LineRules(probe, **rules),
+        clock,
+        device=name,
+        timeout=wiring.timeout,
+        baudrate=wiring.baudrate,
+        transcript=wiring.transcript,
+    )

@@ -75,7 +75,7 @@ class Transcript:
 
 
 def _cut(text: str) -> str:
-    shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    shown = "".join(c if c.isascii() and c.isprintable() else ascii(c)[1:-1] for c in text)
     return shown if len(shown) <= RECENT_CHARACTERS else shown[:RECENT_CHARACTERS] + "..."
 
 
@@ -132,6 +132,7 @@ class LineReader:
         self._port, self._clock, self._transcript = port, clock, transcript
         self._framing, self._unsolicited, self._check = framing, re.compile(unsolicited), check
         self._received = bytearray()
+        self.heard = ""  # the last of what has come; whoever reads empties it where all was understood
 
     @property
     def incomplete(self) -> str:
@@ -194,9 +195,10 @@ class LineReader:
         """The bytes that have arrived (over TCP one of them), or the first to arrive; b"" if the line stays silent."""
         data = bytes(self._port.read(max(1, int(self._port.in_waiting))))
         self._transcript.log_bytes("<", data)
+        self.heard = (self.heard + readable(data))[-LONGEST_LINE:]
         return data
 
 
 def readable(data: bytes | bytearray) -> str:
-    """Bytes as ASCII text, others as backslash escapes."""
-    return bytes(data).decode("ascii", errors="backslashreplace")
+    """Bytes as Latin-1 text: a character a byte."""
+    return bytes(data).decode("latin-1")

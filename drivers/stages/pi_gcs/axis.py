@@ -98,7 +98,7 @@ class PiGcsAxis:
 
     def searching(self) -> bool:
         """Whether the axis moves, or is between two parts of a reference move."""
-        return self._line.ask(READY, r"\\x(b[01])", "the byte B1 (ready) or B0")[1] == "b0" or self.moving()
+        return self._line.ask(READY, "[\xb0\xb1]", "the byte B1 (ready) or B0")[0] == "\xb0" or self.moving()
 
     def counts(self) -> int:
         return self.to_counts(self._line.number("POS?"))

@@ -167,6 +167,10 @@ PAUSE = 0.05  # s before that
 TEXT, WHOLE, NUMBER = r"[^:]*", r"-?\d{1,12}", r"-?\d{1,12}(?:\.\d{1,12})?"
 """Most digits of a position; a longer number is impossible for an axis and for a float."""
 CHECKSUM = "comm.checksum"
+BINARY = (
+    ". A device that is set to Zaber's Binary protocol (usually at 9600 baud) does not understand ASCII: switch it "
+    "with Zaber Launcher, or by the Binary command 124 (Convert To ASCII)"
+)
 KEPT = ("maxspeed", "motion.accelonly", "motion.decelonly")
 """Settings of the axis that survive a power cycle; the driver restores them, and the device's checksums, at the end."""
 
@@ -216,6 +220,7 @@ class ZaberAxis:
             unsolicited=passed_over_form(STOP_ID),
             identified=True,
             check=lambda line: damage(line, must_have_checksum=self._must_have_checksum),
+            unanswered=BINARY,
         )
 
     def open(self) -> dict[str, str]:

@@ -45,6 +45,18 @@ def test_a_reader_that_wants_no_more_is_no_error(folder: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@POSIX
+@pytest.mark.parametrize(("option", "told"), [("--json", ""), ("--no-json", "of a library\n")])
+def test_what_a_library_prints_is_not_among_the_results(tmp_path: Path, option: str, told: str) -> None:
+    """C's stdout is flushed at the end of the process where it is a pipe."""
+    printed = (
+        "import ctypes, sys; from beamline.cli.main import guard_streams; guard_streams(); c = ctypes.CDLL(None); "
+        "c.printf(b'of a library\\n'); print('{}')"
+    )
+    done = subprocess.run([sys.executable, "-c", printed, option], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.stdout, done.stderr, done.returncode) == ("{}\n", told, 0)
+
+
 NAME = os.fsdecode(b"\x1b[2J\x07\xff\xe2\x80\xaea.h5")
 
 

@@ -56,6 +56,15 @@ FAULTS = {
     "infinite": (("exposure_s: 0.01", "exposure_s: .inf"), "my.yaml:4: scan.exposure_s is .inf; expected a number > 0"),
     "not a number": (("exposure_s: 0.01", "exposure_s: short"), "scan.exposure_s is 'short'; expected a number > 0"),
     "truth": (("views: 12", "views: yes"), "my.yaml:3: scan.angles: views is true (YAML reads yes, no, on and off"),
+    "a path of Windows in double quotes": (
+        ("sample: {name: test}", 'sample: {name: test}\nstorage: {folder: "D:\\tomo\\new"}'),
+        "my.yaml:2: storage: folder is 'D:\\tomo\\new', with the control character '\\t': within double quotes a "
+        "backslash begins one; write the text without quotes, or within single ones",
+    ),
+    "a line end in a port": (
+        ('port: "sim://pm16c"', 'port: "COM3\\n"'),
+        "my.yaml:7: devices.stage: port is 'COM3\\n', with the control character '\\n'",
+    ),
     "fraction": (("views: 12", "views: 12.5"), "scan.angles.views is 12.5; expected a whole number > 0"),
     "views without end": (
         ("views: 12", "views: 1000000000"),

@@ -90,6 +90,65 @@ def test_without_a_path_the_installed_library_is_looked_for() -> None:
         pytest.skip("the vendor's library is installed here")
 
 
+FATAL = {  # "does not return from its start" and "ends the process that starts it" stand in docs/faults.md
+    "crashes": ("int dcamapi_init(void *p) { return *(volatile int *)0; }", r"ends the process .*code (-11|1)\b"),
+    "crashes as it is loaded": ("__attribute__((constructor)) void on(void) { __builtin_trap(); }", "ends the process"),
+    "ends the program": ("void exit(int); int dcamapi_init(void *p) { exit(0); }", r"ends the process .*code 0\)"),
+    "hangs": ("int pause(void); int dcamapi_init(void *p) { for (;;) pause(); }", "does not return .* within 1 s"),
+    "hangs as it is loaded": (
+        "int pause(void); __attribute__((constructor)) void on(void) { for (;;) pause(); }",
+        "does not return .* within 1 s",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", FATAL)
+def test_a_library_that_would_end_or_hang_this_process_is_refused(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text, words = FATAL[what]
+    if words.endswith("1 s"):
+        monkeypatch.setattr(abi, "STARTS_WITHIN", 1.0)
+    source, library = tmp_path / "fatal.c", tmp_path / "libfatal.so"
+    source.write_text(text)
+    command = [compiler(), "-w", "-shared", "-fPIC", str(source), "-o", str(library)]
+    subprocess.run(command, check=True)
+    with pytest.raises(DeviceError, match=rf"library .*libfatal\.so {words}.*vendor's DCAM-API.*a process of its own"):
+        abi.Dcam(library, "camera")
+
+
+def test_a_program_with_a_python_of_its_own_goes_without_the_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/opt/host/program")
+    abi.try_out("libfatal-that-nobody-loads.so", "camera")
+
+
+def test_a_library_that_lacks_another_names_it(tmp_path: Path) -> None:
+    needed, library = tmp_path / "libneeded.so", tmp_path / "libneeds.so"
+    for file, text, more in (
+        (needed, "int gone(void) { return 0; }", ()),
+        (library, "int gone(void); int dcamapi_init(void *p) { return gone(); }", (f"-L{tmp_path}", "-lneeded")),
+    ):
+        file.with_suffix(".c").write_text(text)
+        command = [compiler(), "-w", "-shared", "-fPIC", str(file.with_suffix(".c")), "-o", str(file), *more]
+        subprocess.run(command, check=True)
+    needed.unlink()
+    with pytest.raises(DeviceError, match=r"needs libneeded\.so, which is not found .*Install what has libneeded\.so"):
+        abi.Dcam(library, "camera")
+
+
+@pytest.mark.parametrize(
+    ("at", "byte", "words"), [(4, 1, "it is for 32 bits"), (18, 0xF3, "it is for another kind of computer")]
+)
+def test_a_library_for_another_computer_is_named(
+    fake_library: Path, tmp_path: Path, at: int, byte: int, words: str
+) -> None:
+    data, library = bytearray(fake_library.read_bytes()), tmp_path / "libother.so"
+    data[at] = byte  # the class and the processor of an ELF file
+    library.write_bytes(data)
+    with pytest.raises(DeviceError, match=rf"cannot be loaded: {words}"):
+        abi.Dcam(library, "camera")
+
+
 def test_a_library_of_another_kind_is_refused_with_the_missing_calls(fake_library: Path, tmp_path: Path) -> None:
     source, library = tmp_path / "old.c", tmp_path / "libold.so"
     source.write_text("int dcamapi_init(void *p) { return p != 0; }\n")

@@ -278,6 +278,26 @@ OF_LINES = (
         "another device answers",
         ("drivers/stages/test_every_stage.py", "test_the_configured_serial_number_is_required"),
     ),
+    FaultElsewhere(
+        "a terminal server in Telnet mode, one that asks for a login, the port of another service",
+        "the server speaks Telnet",
+        ("drivers/stages/test_terminal_server.py", "test_who_speaks_in_the_place_of_the_controller_is_named"),
+    ),
+    FaultElsewhere(
+        "a terminal server that closes the connection (no traffic, another client)",
+        "the other side closed the connection",
+        ("drivers/stages/test_terminal_server.py", "test_a_server_that_closes_a_connection_is_told_from_a_cable"),
+    ),
+    FaultElsewhere(
+        "another protocol (Zaber's Binary), another baud rate",
+        "it has bytes that are no text",
+        ("drivers/serial/test_line.py", "test_bytes_that_are_no_text_are_refused_in_a_reply_of_any_form"),
+    ),
+    FaultElsewhere(
+        "no right to the port, or another program holds it",
+        "belongs to the group",
+        ("drivers/base/test_causes.py", "test_the_group_that_owns_a_port_is_named"),
+    ),
 )
 OF_MOTION = (
     FaultElsewhere(
@@ -299,7 +319,15 @@ OF_MOTION = (
     ),
 )
 
-_FAULTS: tuple[tuple[Any, ...], ...] = (LINE, OF_LINES), (MOTION, OF_MOTION, PULSES, CAMERA)
+OF_CAMERA = (
+    FaultElsewhere(
+        "the camera's library hangs, or crashes",
+        "ends the process that starts it",
+        ("drivers/dcam/test_abi.py", "test_a_library_that_would_end_or_hang_this_process_is_refused"),
+    ),
+)
+
+_FAULTS: tuple[tuple[Any, ...], ...] = (LINE, OF_LINES), (MOTION, OF_MOTION, PULSES, CAMERA, OF_CAMERA)
 WORDS: Mapping[str, str] = MappingProxyType(
     {row.fault: row.words for rows in _FAULTS[0] for row in rows}
     | {UNPLUGGED: PORT_FAILED}
@@ -314,7 +342,7 @@ def applies() -> None:
         assert set(row.not_on) <= set(KINDS) and set(row.harmless_on) <= set(KINDS)
         assert all(row.not_on.values()) and all(row.harmless_on.values())
     assert all(set(row.says) == set(KINDS) for row in MOTION)
-    for elsewhere in (*OF_LINES, *OF_MOTION):
+    for elsewhere in (*OF_LINES, *OF_MOTION, *OF_CAMERA):
         path, name = elsewhere.test
         text = (TESTS / path).read_text(encoding="utf-8")
         assert f"def {name}(" in text and elsewhere.words in text, elsewhere.fault

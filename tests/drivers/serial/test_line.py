@@ -166,6 +166,34 @@ def test_a_reply_of_another_form_is_named_and_not_believed(reply: bytes) -> None
     assert echo.heard == ["N?1", "ID?", "N?2"]
 
 
+@pytest.mark.parametrize("reply", [b"\xff\xfb\x0112\r\n", b"1\x002\r\n", b"\xb112\r\n", b"\x7f\r\n"])
+def test_bytes_that_are_no_text_are_refused_in_a_reply_of_any_form(reply: bytes) -> None:
+    line = connect(Echo({0: [(0.0, reply)]}))
+    with pytest.raises(DeviceError, match=r"have the form it must have: it has bytes that are no text.*baud rate"):
+        line.query("N?1", ".*", "anything")
+    assert ask(line, 2) == 2
+
+
+def test_a_control_byte_may_be_answered_by_a_byte() -> None:
+    class Ready(Echo):
+        def receive(self, data: bytes) -> None:
+            self._coming.append((self.clock.now(), b"\xb1\r\n"))
+
+    assert connect(Ready()).query(b"\x07", "[\xb0\xb1]", "ready or not")[0] == "\xb1"
+
+
+def test_a_device_that_has_never_answered_may_be_set_otherwise() -> None:
+    rules = LineRules(Probe("ID?", "ECHO"), unanswered=". It may be set to another protocol")
+    echo = Echo({0: [], 3: []})
+    line = SerialLine(register(next(NAMES), echo), rules, echo.clock, device="echo", timeout=0.5, baudrate=9600)
+    with pytest.raises(DeviceTimeout, match="another protocol"):
+        ask(line, 1)
+    assert ask(line, 2) == 2
+    with pytest.raises(DeviceTimeout, match="baud rate") as later:
+        ask(line, 3)
+    assert "another protocol" not in str(later.value)
+
+
 def test_a_device_that_never_stops_sending_is_named() -> None:
     line = connect(Echo({0: [(0.01 * k, b"x\r\n") for k in range(400)]}))
     with pytest.raises(DeviceError):

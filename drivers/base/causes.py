@@ -1,0 +1,121 @@
+"""Causes: why a module is another one, a library does not load, a port does not open, and who else speaks on a line.
+
+The one place where drivers turn what others say (loaders, operating systems, servers) into a sentence and the way on.
+"""
+
+from __future__ import annotations
+
+import errno
+import re
+import sysconfig
+from contextlib import suppress
+from pathlib import Path
+
+from drivers.base.errors import DeviceError
+
+_LOADERS = (
+    (r"ELFCLASS(\d+)", "it is for {0} bits, and this Python is not", "Give the library for this Python"),
+    (
+        r"^itself: cannot open|WinError 193|incompatible arch|mach-o",
+        "it is for another kind of computer, and this Python is of " + sysconfig.get_platform(),
+        "Give the library for this computer",
+    ),
+    (
+        r"([^\s:(]+): cannot open shared|Library not loaded: (\S+)",
+        "it needs {0}, which is not found",
+        "Install what has {0}, or add its folder to LD_LIBRARY_PATH",
+    ),
+    (
+        r"one of its dependencies|WinError 126",
+        "a library that it needs is not found",
+        "Install the vendor's runtime again, with all its parts",
+    ),
+    (
+        r"(?:undefined symbol:|symbol not found[^:]*:|version) (\S+)",
+        "it does not fit the other libraries here: {0} is missing",
+        "Install the version that was made for this system",
+    ),
+    ("", "it is there, but no library that can be loaded", "Check the file, and the right to read it"),
+)  # what the loaders of Linux (which calls one for another processor not found), macOS and Windows say
+
+
+def of_module(name: str, package: str, problem: ImportError) -> DeviceError:
+    """The error where a module is not that of the package that drivers need."""
+    return DeviceError(
+        f"module {name}",
+        f"it is not that of {package} ({problem})",
+        advice=f"Where PyPI's package `{name}` has taken its place: `pip uninstall {name}`, then `pip install "
+        f"--force-reinstall {package}`. Where a {name}.py or a folder of yours has, rename that",
+        state="Nothing was sent",
+    )
+
+
+def of_library(name: str, problem: OSError) -> tuple[str, str]:
+    """Why a library is not loaded, and what to do; both empty where it is not there."""
+    for said, what, advice in _LOADERS if Path(name).exists() else ():
+        if match := re.search(said, str(problem).replace(name, "itself"), re.IGNORECASE):
+            return what.format(*filter(None, match.groups())), advice.format(*filter(None, match.groups()))
+    return "", ""
+
+
+def of_port(url: str, problem: BaseException) -> str:
+    """What to do about a port that does not open."""
+    number, group = getattr(problem, "errno", None) or getattr(problem.__context__, "errno", None), "root"
+    with suppress(OSError, ValueError, KeyError, NotImplementedError):  # no file, a group without a name, Windows
+        group = Path(url).group() if Path(url).stat().st_mode & 0o060 == 0o060 else group
+    rows = (
+        (
+            number in (errno.EACCES, errno.EPERM) and group != "root",
+            f"It belongs to the group {group}: `sudo usermod -aG {group} $USER`, then log out and in",
+        ),
+        (
+            number in (errno.EACCES, errno.EPERM),
+            "This account has no right to it: ask for a udev rule that gives it to a group of yours (GROUP, MODE)",
+        ),
+        (
+            number in (errno.EBUSY, errno.EAGAIN) or "PermissionError(13" in str(problem),  # the latter on Windows
+            f"Another program holds it (on Linux, `fuser {url}` names it): close that",
+        ),
+        (
+            number == errno.ECONNREFUSED,
+            "Nothing listens there, or the server takes no further client: check the port's number, close others",
+        ),
+        (True, "Check the cable, the port's name in the configuration and that no other program holds it"),
+    )
+    return next(advice for holds, advice in rows if holds)
+
+
+NO_TEXT = re.compile(r"[^\t\n\r -~]")  # a character that no text of a device has
+_FOREIGN = (  # searched in the URL, a line end, and what was heard
+    (
+        r"^socket:.*\xff[\xf0-\xfe]",  # on a serial line it is noise
+        "the server speaks Telnet (FF begins its negotiation)",
+        "Set this port of the terminal server to raw TCP: no Telnet, no RFC 2217",
+    ),
+    (
+        r"\b(login|user ?name|password) ?:",
+        "a login is asked for",
+        "Set this port of the terminal server to raw TCP, without a login",
+    ),
+    (
+        r"HTTP/\d|<html|SSH-\d",
+        "a web or SSH server answers",
+        "Give the number of the port that leads to the serial line",
+    ),
+    (
+        r"already in use|(port|line) is (in use|busy)|too many (clients|connections|sessions)",
+        "another client holds the server's port",
+        "Close the other program, or let the server take a second client",
+    ),
+    (
+        rf"\n.*{NO_TEXT.pattern}",
+        "it has bytes that are no text",
+        "Check the baud rate, the cable, and that the device is set to speak text",
+    ),
+)
+
+
+def of_bytes(url: str, heard: str) -> tuple[str, str]:
+    """Who speaks on a line in the place of its device, by what was heard (a character a byte), and what to do."""
+    flags = re.IGNORECASE | re.DOTALL
+    return next((row[1:] for row in _FOREIGN if re.search(row[0], f"{url}\n{heard}", flags)), ("", ""))
