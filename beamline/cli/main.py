@@ -29,6 +29,7 @@ from beamline.core.errors import (
 )
 from beamline.core.installed import version
 from beamline.core.text import printable
+from recon import use_compiled_kernels
 from recon.base.registry import ADD_ONS, Registry, add_on_missing, did_you_mean, tables_in_folders
 
 
@@ -259,6 +260,7 @@ Exit codes:
   7    the scan is complete, but the monitor raised alarms
   130  interrupted before there was a result, or aborted
 """
+_MOST_THREADS = 4096  # numba starts all of them, and a system that refuses one ends the process
 
 
 @click.group(cls=LazyGroup, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
@@ -272,9 +274,9 @@ def main(debug: bool) -> None:
     Results go to stdout, messages and progress to stderr.
     """
     threads = os.environ.get("NUMBA_NUM_THREADS", "1").strip()
-    if not (threads.isdecimal() and int(threads) > 0):
+    if not (threads.isdecimal() and 0 < int(threads) <= _MOST_THREADS):
         raise click.UsageError(
-            f"NUMBA_NUM_THREADS={threads} in the environment; expected a number of threads, 1 or more."
+            f"NUMBA_NUM_THREADS={threads} in the environment; expected a number of threads, 1 to {_MOST_THREADS}."
         )
 
 
@@ -287,6 +289,8 @@ def run() -> NoReturn:
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
     os.environ["MPLBACKEND"] = "agg"  # that of a notebook that started this may be absent here: matplotlib refuses it
+    if os.environ.pop("NUMBA_DISABLE_JIT", None):  # kernels as plain Python take hours, and some are none
+        use_compiled_kernels()
     guard_streams()
     code = 0
     try:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import suppress
 from pathlib import Path
+from traceback import walk_tb
 from types import ModuleType, TracebackType
 
 
@@ -41,6 +41,7 @@ _DISTRIBUTIONS = {
     **{"PIL": "pillow", "serial": "pyserial", "skimage": "scikit-image", "usb": "pyusb", "yaml": "pyyaml"},
     "zlib_ng": "zlib-ng",
 }
+_IMPORTERS = ("importlib", "_frozen_importlib", "_frozen_importlib_external")
 _WITHOUT = {"torch": " Without it, use -m fbp, -m fista-tv or -m auto."}
 
 
@@ -68,65 +69,41 @@ def package_problem(home: str) -> str:
 
 def installation_problem(error: BaseException) -> str:
     """A sentence with advice on the library whose loading raised `error`; "" if no loading did."""
-    if not (name := _library(error)):
+    if _ours(name := _library(error)):
         return ""
-    cause, origin, needed = error.__cause__ or error, _origin(name), _needed(name)
-    if name in sys.stdlib_module_names:
-        where = f"Python's own was expected, of {sys.executable}"
-        advice = (
-            "use another Python" if origin is None or _installed(origin) else f"{origin} hides it: {_way_out(origin)}"
-        )
-    elif origin is None:
-        where, advice = f"{sys.executable} does not find it", f"install it: pip install {needed}"
+    cause, origin, package = error.__cause__ or error, _origin(name), _DISTRIBUTIONS.get(name, name)
+    if origin is None:
+        advice = f"{sys.executable} does not find it. Install it: pip install {package}"
+    elif name in sys.stdlib_module_names or not _installed(origin):
+        advice = f"Python finds it at {origin}. If that is not the true one, {_way_out(origin)}"
     else:
-        where, advice = f"It is at {origin}", f"install it again: pip install --force-reinstall {needed}"
-        if not _installed(origin):
-            advice = f"if this is another one, {_way_out(origin)}; if not, {advice}"
+        advice = f"It is at {origin}. Install it again: pip install --force-reinstall {package}"
     said = " ".join(f"{type(cause).__name__}: {cause}".split())
-    return f"the library {name!r} cannot be loaded ({said}). {where}; {advice}.{_WITHOUT.get(name, '')}"
+    return f"the library {name!r} cannot be loaded ({said}). {advice}.{_WITHOUT.get(name, '')}"
 
 
 def as_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """`sys.excepthook` that says in one line which library cannot be loaded."""
     if problem := installation_problem(error):
-        sys.stderr.write(f"beamline: {problem}\n")
-    else:
-        sys.__excepthook__(kind, error, trace)
-
-
-def _needed(name: str) -> str:
-    """A library as pip takes it, in quotes where its version matters."""
-    from importlib import metadata
-
-    package = _DISTRIBUTIONS.get(name, name)
-    with suppress(metadata.PackageNotFoundError):
-        for each in metadata.requires("splatline") or ():
-            if each.startswith(package) and not each[len(package)].isalnum() and "extra ==" not in each:
-                return f'"{each}"'
-    return package
+        sys.exit(f"beamline: {problem}")
+    sys.__excepthook__(kind, error, trace)
 
 
 def _library(error: BaseException) -> str:
-    """The top-level name of the library whose import raised the error; "" if none did."""
-    name = error.name if isinstance(error, ImportError) else None
-    if isinstance(error, AttributeError) and isinstance(error.obj, ModuleType):  # np.zeros, where np is the user's
-        file = getattr(error.obj, "__file__", None)
-        name = error.obj.__name__ if file and not _installed(file) else None
-    root = (name or _imported(error.__traceback__, isinstance(error, ImportError))).partition(".")[0]
-    return "" if _ours(root) else root
-
-
-def _imported(trace: TracebackType | None, failed: bool) -> str:
-    """The library that our code was importing; "" where it called one, unless an import `failed` in that call."""
-    name = ""
-    while trace is not None:
-        root, what = str(trace.tb_frame.f_globals.get("__name__")).partition(".")[0], trace.tb_frame.f_code.co_name
-        if _ours(root):
-            name = ""
-        elif not name and root not in ("importlib", "_frozen_importlib", "_frozen_importlib_external"):
-            name = root if failed or what == "<module>" else "a call"
-        trace = trace.tb_next
-    return "" if name == "a call" else name
+    """The top-level name of the module whose import raised the error; "" if none did."""
+    failed = isinstance(error, ImportError)
+    if isinstance(error, ImportError) and error.name:
+        return error.name.partition(".")[0]
+    module = error.obj if isinstance(error, AttributeError) else None
+    if isinstance(module, ModuleType) and not _installed(getattr(module, "__file__", None) or os.__file__):
+        return module.__name__.partition(".")[0]  # np.zeros, where np is the user's
+    frames = [
+        (str(frame.f_globals.get("__name__")).partition(".")[0], frame.f_code.co_name)
+        for frame, _ in walk_tb(error.__traceback__)
+    ]
+    last = max((at for at, (root, _) in enumerate(frames) if _ours(root)), default=-1)
+    called = [frame for frame in frames[last + 1 :] if frame[0] not in _IMPORTERS]
+    return next((root for root, what in called[:1] if failed or what == "<module>"), "")
 
 
 def _ours(root: str) -> bool:
