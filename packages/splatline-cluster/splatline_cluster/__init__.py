@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 from threading import Event
 from typing import Any
 
@@ -114,7 +115,7 @@ def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[C
         first_worker_s: s to wait for the first worker.
 
     Raises:
-        ConfigError: no scheduler answers, or no worker comes in time.
+        ConfigError: no scheduler answers, no worker comes in time, or one has not the same version of splatline.
     """
     with ExitStack() as closing:
         closing.enter_context(dask.config.set({"distributed.admin.large-graph-warning-threshold": _TASK_SIZE_WARNING}))
@@ -143,4 +144,23 @@ def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[C
                 f"--cluster {spec}: the scheduler has no workers, and none came in {first_worker_s:g} s. Start some: "
                 f"dask worker {spec}."
             ) from None
+        _require_same_version(client, spec)
         yield Cluster(max(1, _count(client)), client)
+
+
+def _require_same_version(client: Client, spec: str) -> None:
+    """Raises ConfigError if a worker lacks this package, or has another version of splatline."""
+    here, told = recon.__version__, dict[str, list[str]]()
+    # A function of Python: a worker without this package has none of ours.
+    found = client.run(resolve_name, "splatline_cluster:recon.__version__", on_error="return")
+    for worker, there in found.items():
+        if isinstance(there, Exception):
+            told.setdefault(f"splatline or splatline-cluster cannot be loaded ({there})", []).append(worker)
+        elif there != here:
+            told.setdefault(f"splatline is {there}", []).append(worker)
+    if told:
+        what = "; ".join(f"{what} at {', '.join(sorted(workers)[:3])}" for what, workers in told.items())
+        raise ConfigError(
+            f"--cluster {spec}: {sum(map(len, told.values()))} of {len(found)} workers cannot take part: {what}. Start "
+            f"the workers where splatline {here} and splatline-cluster are installed. Nothing was read."
+        )
