@@ -6,7 +6,7 @@ import os
 import sys
 from pathlib import Path
 from traceback import walk_tb
-from types import ModuleType, TracebackType
+from types import FrameType, ModuleType, TracebackType
 
 
 def config_folder() -> Path:
@@ -108,6 +108,12 @@ def _library(error: BaseException) -> str:
 
 def _ours(root: str) -> bool:
     return root in ("", "__main__", "beamline", *OWN_PACKAGES) or root.startswith("splatline")
+
+
+def of_library(frame: FrameType) -> bool:
+    """Whether code of Python or of an installed package of others runs in a frame."""
+    root = str(frame.f_globals.get("__name__")).partition(".")[0]
+    return not _ours(root) and _installed(_origin(root) or os.__file__)
 
 
 def _installed(file: str) -> bool:
