@@ -194,15 +194,19 @@ def readable(path: Path) -> Iterator[None]:
         ) from error
 
 
+_CONTENT = r"array|bytes|unsized|'(Dataset|Datatype|Empty|Group|str)'"  # of a TypeError by what a file holds
+
+
 def _of_our_own(error: Exception) -> bool:
     """Whether a mistake of a reader raised it, and no library that met what it did not expect.
 
     A dataset where a group was expected lacks that group's attributes: the object is the file's then.
     """
-    mistake = isinstance(error, AttributeError | TypeError | LookupError | AssertionError | UnboundLocalError)
     content = isinstance(
-        getattr(error, "obj", None), h5py.HLObject | h5py.Datatype | np.ndarray | np.generic | str | bytes
+        getattr(error, "obj", None), h5py.HLObject | h5py.Empty | np.ndarray | np.generic | str | bytes
     )
+    of_type = isinstance(error, TypeError) and not re.search(_CONTENT, str(error))
+    mistake = of_type or isinstance(error, AttributeError | LookupError | AssertionError)
     *_, (frame, _) = walk_tb(error.__traceback__)
     return mistake and not content and not of_library(frame)
 
