@@ -60,7 +60,7 @@ def test_a_damaged_reference_is_left_out_of_the_mean(tmp_path: Path) -> None:
     assert told == []
     (tmp_path / "scan.h5").unlink()
     spoilt, told = prepare(scan(tmp_path, 1, 3), SELECTION)
-    assert "Frames 1, 3 " in told[0] and "left out" in told[0]
+    assert "Frames 1, 3: " in told[0] and "left out" in told[0]
     # One count is in the last pixel of the good second flat: 1/20000 of the light, half of it in the mean.
     np.testing.assert_allclose(spoilt.projections.data, good.projections.data, atol=1e-4)
 

@@ -111,7 +111,7 @@ def test_what_a_dead_writers_file_says_otherwise_of_a_frame_is_named(
         shutil.copy(tmp_path / "s.h5", tmp_path / "died.h5")
     done = recover(_aged(tmp_path / "died.h5"))
     assert (done.changed, done.altered) == (True, (4,))
-    assert "10 frames recovered; what it says of frames 4 is not as it was" in done.in_words()
+    assert "10 frames recovered; with another record than was written: frame 4." in done.in_words()
 
 
 @pytest.mark.parametrize("ahead", [1e3, 1e6])
