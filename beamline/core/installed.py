@@ -113,7 +113,7 @@ def _ours(root: str) -> bool:
 def of_library(frame: FrameType) -> bool:
     """Whether code of Python or of an installed package of others runs in a frame."""
     root = str(frame.f_globals.get("__name__")).partition(".")[0]
-    return not _ours(root) and _installed(_origin(root) or os.__file__)
+    return not _ours(root) and _installed(_origin(root) or frame.f_code.co_filename)
 
 
 def _installed(file: str) -> bool:
