@@ -29,8 +29,8 @@ from beamline.core.errors import (
 )
 from beamline.core.installed import version
 from beamline.core.text import printable
-from recon import use_compiled_kernels
 from recon.base.registry import ADD_ONS, Registry, add_on_missing, did_you_mean, tables_in_folders
+from recon.compiled import use_compiled_kernels
 
 
 @dataclass(frozen=True)

@@ -123,3 +123,13 @@ def test_a_file_of_the_user_by_the_name_of_a_library(name: str, said: str, tmp_p
     done = run(command, tmp_path)
     assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
     assert said in done.stderr and str(file) in done.stderr and "rename that one" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["drivers", "recon"])
+def test_a_folder_of_the_lab_beside_ours_adds_its_modules(name: str, tmp_path: Path) -> None:
+    """Without an __init__.py of its own, with which it hides ours."""
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "of_the_lab.py").write_text("here = 'theirs'\n", encoding="utf-8")
+    script = tmp_path / "study.py"
+    script.write_text(f"from {name}.of_the_lab import here\nimport beamline.api\nprint(here)\n", encoding="utf-8")
+    assert run(script, tmp_path).stdout == "theirs\n"
