@@ -252,7 +252,7 @@ _EXIT_CODES = """\b
 Exit codes:
   0    done
   1    a defect of this program; the message names the file with its traceback
-  2    wrong usage or configuration; nothing was started
+  2    wrong usage, configuration or installation; nothing was started
   3    a device failed or did not answer
   4    stopped on request; the output holds the data so far
   5    data or disk: frames are missing, or a file cannot be read or written

@@ -32,11 +32,10 @@ def version() -> str:
 
 OWN_PACKAGES = ("drivers", "recon", "simulators")
 _MARK = b"splatline"  # in the first line of each one's __init__.py
-_LIBRARIES = (
+_LIBRARIES = (  # that ours import; each is a folder, so that a file of that name is another module
     *("PIL", "click", "h5py", "hdf5plugin", "jinja2", "matplotlib", "numba", "numpy", "psutil", "pydantic", "rich"),
     *("scipy", "serial", "skimage", "starlette", "tifffile", "torch", "usb", "uvicorn", "yaml", "zlib_ng"),
 )
-"""What ours import. Each is a folder: one file of that name is another module."""
 _DISTRIBUTIONS = {
     **{"PIL": "pillow", "serial": "pyserial", "skimage": "scikit-image", "usb": "pyusb", "yaml": "pyyaml"},
     "zlib_ng": "zlib-ng",

@@ -29,8 +29,7 @@ _LAST_WORK = 20.0  # real s that an orphan may take to notice
 _LAST_LINES = 5.0  # real s to read the last output of a killed process; its own child may hold the pipe open
 
 
-PYTHON = "BEAMLINE_PYTHON"
-"""Variable of the environment with the Python that runs parts of a scan, where Python runs inside another program."""
+PYTHON = "BEAMLINE_PYTHON"  # in the environment: the program that runs parts of a scan, where a host runs Python
 
 
 class NoPythonError(ConfigError, OSError):

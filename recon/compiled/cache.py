@@ -139,9 +139,9 @@ def _launch() -> None:
     except ValueError as error:
         stated, config.THREADING_LAYER = config.THREADING_LAYER, "default"
         _launched_by_numba()
-        why = str(error).splitlines()[0].rstrip(".")
         warnings.warn(
-            f"NUMBA_THREADING_LAYER={stated} in the environment is not used ({why}). Another layer is. Unset it.",
+            f"NUMBA_THREADING_LAYER={stated} in the environment is not used. Another layer is. Unset it "
+            f"({str(error).splitlines()[0]}).",
             stacklevel=2,
         )
 

@@ -150,17 +150,13 @@ def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[C
 
 def _require_same_version(client: Client, spec: str) -> None:
     """Raises ConfigError if a worker lacks this package, or has another version of splatline."""
-    here, told = recon.__version__, dict[str, list[str]]()
     # A function of Python: a worker without this package has none of ours.
     found = client.run(resolve_name, "splatline_cluster:recon.__version__", on_error="return")
-    for worker, there in found.items():
-        if isinstance(there, Exception):
-            told.setdefault(f"splatline or splatline-cluster cannot be loaded ({there})", []).append(worker)
-        elif there != here:
-            told.setdefault(f"splatline is {there}", []).append(worker)
-    if told:
-        what = "; ".join(f"{what} at {', '.join(sorted(workers)[:3])}" for what, workers in told.items())
+    others = {worker: there for worker, there in found.items() if there != recon.__version__}
+    for worker, there in others.items():
+        lacks = isinstance(there, Exception)
+        what = f"splatline or splatline-cluster cannot be loaded ({there})" if lacks else f"splatline is {there}"
         raise ConfigError(
-            f"--cluster {spec}: {sum(map(len, told.values()))} of {len(found)} workers cannot take part: {what}. Start "
-            f"the workers where splatline {here} and splatline-cluster are installed. Nothing was read."
+            f"--cluster {spec}: {len(others)} of {len(found)} workers cannot take part: {what} at {worker}. Start the "
+            f"workers where splatline {recon.__version__} and splatline-cluster are installed. Nothing was read."
         )
