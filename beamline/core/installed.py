@@ -74,7 +74,7 @@ def installation_problem(error: BaseException) -> str:
     if origin is None:
         advice = f"{sys.executable} does not find it. Install it: pip install {package}"
     elif name in sys.stdlib_module_names or not _installed(origin):
-        advice = f"Python finds it at {origin}. If that is not the true one, {_way_out(origin)}"
+        advice = f"Python finds it at {origin}. If that is another one, {_way_out(origin)}; if not, install it again"
     else:
         advice = f"It is at {origin}. Install it again: pip install --force-reinstall {package}"
     said = " ".join(f"{type(cause).__name__}: {cause}".split())
