@@ -2,11 +2,14 @@
 
 import sys
 
-from beamline.core.installed import package_problem
+from beamline.core.installed import as_one_line, package_problem
 
+_is_command = sys.argv[0].endswith(("beamline", "beamline.exe"))
 if _problem := package_problem(__path__[0].removesuffix("beamline").rstrip("/\\")):
     # A command says it in one line, without a traceback.
-    raise (SystemExit if sys.argv[0].endswith(("beamline", "beamline.exe")) else ImportError)(_problem)
+    raise (SystemExit if _is_command else ImportError)(_problem)
+if _is_command:
+    sys.excepthook = as_one_line  # of what a command loads before it can say anything
 
 
 def __getattr__(name: str) -> str:

@@ -7,6 +7,7 @@ first use: a program that only plans a scan starts quickly.
 from __future__ import annotations
 
 import os
+from pkgutil import extend_path
 from typing import TYPE_CHECKING, Any
 
 from recon.base.geometry import Geometry
@@ -19,6 +20,7 @@ from recon.base.volume import Grid, Volume
 from recon.compiled import use_compiled_kernels
 from recon.methods import REGISTRY
 
+__path__ = extend_path(__path__, __name__)  # a lab's folder recon/ without __init__.py adds its modules
 use_compiled_kernels()  # before numba is imported, which happens where something is computed
 
 # libgomp reads this when torch or numba load it: without it idle threads spin, and two processes that share the cores

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Self
 
@@ -11,6 +12,7 @@ from recon.base.choices import AUTO, Quality
 from recon.base.decisions import Decisions
 from recon.base.geometry import Geometry
 from recon.base.method import Method, ReconProblem, Reconstruction, RunControl
+from recon.base.registry import LibraryError
 from recon.base.setting import NonNegative
 from recon.base.view_data import Views
 from recon.base.volume import Grid
@@ -59,12 +61,21 @@ class Auto(Method):
         """
         decide = control.decide or Decisions(problem.seed)
         choice = TrialChoice.of(decide("method", lambda: self.choose(problem, control)))
-        chosen = self.candidates[-1 if choice.at is None else choice.at]
-        device = chosen.device_of(problem)
         decide.prior = choice.prior
-        result = chosen.run(replace(problem, device=device), replace(control, decide=decide))
+        chosen, result = self._made(choice, problem, replace(control, decide=decide))
         settings = {**result.settings, "chosen_method": chosen.name, "chosen_because": choice.reason}
         return replace(result, settings=settings, method=chosen.name, chosen=choice.reason)
+
+    def _made(self, choice: TrialChoice, problem: ReconProblem, control: RunControl) -> tuple[Method, Reconstruction]:
+        """The candidate that is chosen, and what it makes: without a choice the last one whose library loads."""
+        chosen = self.candidates[-1 if choice.at is None else choice.at]
+        try:
+            return chosen, chosen.run(replace(problem, device=chosen.device_of(problem)), control)
+        except LibraryError as error:
+            if choice.at is not None or len(self.candidates) == 1:
+                raise
+            warnings.warn(f"{chosen.name} is left out: {error}", stacklevel=2)
+            return replace(self, candidates=self.candidates[:-1])._made(choice, problem, control)
 
     def choose(self, problem: ReconProblem, control: RunControl) -> TrialChoice:
         """Which candidate predicts views held out.

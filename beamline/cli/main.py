@@ -30,6 +30,7 @@ from beamline.core.errors import (
 from beamline.core.installed import version
 from beamline.core.text import printable
 from recon.base.registry import ADD_ONS, Registry, add_on_missing, did_you_mean, tables_in_folders
+from recon.compiled import use_compiled_kernels
 
 
 @dataclass(frozen=True)
@@ -258,7 +259,7 @@ _EXIT_CODES = """\b
 Exit codes:
   0    done
   1    a defect of this program; the message names the file with its traceback
-  2    wrong usage or configuration; nothing was started
+  2    wrong usage, configuration or installation; nothing was started
   3    a device failed or did not answer
   4    stopped on request; the output holds the data so far
   5    data or disk: frames are missing, or a file cannot be read or written
@@ -266,6 +267,7 @@ Exit codes:
   7    the scan is complete, but the monitor raised alarms
   130  interrupted before there was a result, or aborted
 """
+_MOST_THREADS = 4096  # numba starts all of them, and a system that refuses one ends the process
 
 
 @click.group(cls=LazyGroup, epilog=_EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
@@ -279,9 +281,9 @@ def main(debug: bool) -> None:
     Results go to stdout, messages and progress to stderr.
     """
     threads = os.environ.get("NUMBA_NUM_THREADS", "1").strip()
-    if not (threads.isdecimal() and int(threads) > 0):
+    if not (threads.isdecimal() and 0 < int(threads) <= _MOST_THREADS):
         raise click.UsageError(
-            f"NUMBA_NUM_THREADS={threads} in the environment; expected a number of threads, 1 or more."
+            f"NUMBA_NUM_THREADS={threads} in the environment; expected a number of threads, 1 to {_MOST_THREADS}."
         )
 
 
@@ -294,6 +296,8 @@ def run() -> NoReturn:
     warnings.simplefilter("ignore", RuntimeWarning)  # numpy's, of inf and NaN: such results are reported in words
     warnings.showwarning = lambda message, *_: click.echo(f"Warning: {message}", err=True)
     os.environ["MPLBACKEND"] = "agg"  # that of a notebook that started this may be absent here: matplotlib refuses it
+    if os.environ.pop("NUMBA_DISABLE_JIT", None):  # kernels as plain Python take hours, and some are none
+        use_compiled_kernels()
     guard_streams()
     code = 0
     try:

@@ -17,7 +17,7 @@ from beamline.core.errors import AlarmError, ScanStopped
 from beamline.core.events import Done, FrameFlagged, Sink, Warned
 from beamline.core.files import refuse_existing, write_whole
 from beamline.core.stop import StopOnSignal
-from beamline.core.text import SENTENCE, one_line, spans
+from beamline.core.text import SENTENCE, count, frames_text, one_line, spans
 from drivers.base.clock import Clock, SystemClock
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def _in_lines(file: Path, watched: _Watched) -> list[str]:
     summed = watched.verdict
     end = f"{one_line(str(file), SENTENCE)}: {summed.n_frames} frames, flagged: {counted(summed.flags)}"
     if again := summed.retaken:
-        end += f"; {len(again)} views were taken again: frames {spans(again)} do not count"
+        end += f"; taken again, so that it does not count: {frames_text(again)}"
     altered = [summed.altered] if summed.altered else []
     left_out = [f"Not looked at: {'; '.join(summed.aside)}."] if summed.aside else []
     return [*table(summed.kinds), *summed.references, *altered, *left_out, *watched.ended, end]
@@ -172,7 +172,7 @@ def table(kinds: Iterable[Kind]) -> list[str]:
             top, bottom, left, right = worst.region
             where = f", rows {top}-{bottom - 1}, columns {left}-{right - 1}"
         lines += [
-            f"{kind.level:<6}{kind.check:<12}{len(kind.frames)} frames: {spans(kind.frames)}",
+            f"{kind.level:<6}{kind.check:<12}{count(len(kind.frames), 'frame')}: {spans(kind.frames)}",
             f"{'':<18}worst {worst.score:.4g} of {worst.limit:.4g} {units[kind.check]}, in frame {worst.frame}{where}",
             f"{'':<18}{worst.advice}",
         ]

@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from beamline.core.installed import version
+from beamline.core.installed import installation_problem, version
 from drivers.base.errors import DeviceError
 
 
@@ -95,7 +95,7 @@ def exit_code(error: BaseException) -> int:
         return DataError.exit_code
     if isinstance(error, OSError) and error.errno not in (None, errno.EPIPE):  # one without a number is a defect
         return DataError.exit_code
-    return BeamlineError.exit_code
+    return ConfigError.exit_code if installation_problem(error) else BeamlineError.exit_code
 
 
 def out_of_memory(error: BaseException) -> bool:
@@ -129,6 +129,8 @@ def user_message(error: BaseException) -> str:
         return f"The file is damaged: HDF5 says {str(error).strip(chr(39))!r}. Use a copy of it, or the original."
     if isinstance(error, KeyboardInterrupt):
         return str(error) or "interrupted"
+    if not isinstance(error, BeamlineError | DeviceError) and (problem := installation_problem(error)):
+        return problem
     if is_defect(error):
         what = " ".join(str(error).split()) or "nothing more is known"
         return f"a defect in this program: {type(error).__name__}: {what}"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from importlib import metadata
 from pathlib import Path
+from traceback import walk_tb
+from types import FrameType, ModuleType, TracebackType
 
 
 def config_folder() -> Path:
@@ -21,6 +22,8 @@ def shipped_scenes() -> dict[str, Path]:
 
 def version() -> str:
     """The installed distribution's version; "uninstalled" when run from a bare checkout."""
+    from importlib import metadata  # here: it imports much that a file of the user may hide
+
     try:
         return metadata.version("splatline")
     except metadata.PackageNotFoundError:
@@ -29,6 +32,16 @@ def version() -> str:
 
 OWN_PACKAGES = ("drivers", "recon", "simulators")
 _MARK = b"splatline"  # in the first line of each one's __init__.py
+_LIBRARIES = (  # that ours import; each is a folder, so that a file of that name is another module
+    *("PIL", "click", "h5py", "hdf5plugin", "jinja2", "matplotlib", "numba", "numpy", "psutil", "pydantic", "rich"),
+    *("scipy", "serial", "skimage", "starlette", "tifffile", "torch", "usb", "uvicorn", "yaml", "zlib_ng"),
+)
+_DISTRIBUTIONS = {
+    **{"PIL": "pillow", "serial": "pyserial", "skimage": "scikit-image", "usb": "pyusb", "yaml": "pyyaml"},
+    "zlib_ng": "zlib-ng",
+}
+_IMPORTERS = ("importlib", "_frozen_importlib", "_frozen_importlib_external")
+_WITHOUT = {"torch": " Without it, use -m fbp, -m fista-tv or -m auto."}
 
 
 def package_problem(home: str) -> str:
@@ -47,7 +60,66 @@ def package_problem(home: str) -> str:
         with open(origin, "rb") as file:  # noqa: PTH123
             if _MARK not in file.readline():
                 return f"{origin} is not splatline's: {_way_out(origin)}."
+    for name in _LIBRARIES:
+        if (origin := _origin(name) or "").endswith(f"{os.sep}{name}.py"):
+            return f"{origin} hides the library {name!r}, which splatline needs: {_way_out(origin)}."
     return ""
+
+
+def installation_problem(error: BaseException) -> str:
+    """A sentence with advice on the library whose loading raised `error`; "" if no loading did."""
+    if _ours(name := _library(error)):
+        return ""
+    cause, origin, package = error.__cause__ or error, _origin(name), _DISTRIBUTIONS.get(name, name)
+    if origin is None:
+        advice = f"{sys.executable} does not find it. Install it: pip install {package}"
+    elif name in sys.stdlib_module_names or not _installed(origin):
+        advice = f"Python finds it at {origin}. If that is another one, {_way_out(origin)}; if not, install it again"
+    else:
+        advice = f"It is at {origin}. Install it again: pip install --force-reinstall {package}"
+    said = " ".join(f"{type(cause).__name__}: {cause}".split())
+    return f"the library {name!r} cannot be loaded ({said}). {advice}.{_WITHOUT.get(name, '')}"
+
+
+def as_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """`sys.excepthook` that says in one line which library cannot be loaded."""
+    if problem := installation_problem(error):
+        sys.exit(f"beamline: {problem}")
+    sys.__excepthook__(kind, error, trace)
+
+
+def _library(error: BaseException) -> str:
+    """The top-level name of the module whose import raised the error; "" if none did."""
+    failed = isinstance(error, ImportError)
+    if isinstance(error, ImportError) and error.name:
+        return error.name.partition(".")[0]
+    module = error.obj if isinstance(error, AttributeError) else None
+    if isinstance(module, ModuleType) and not _installed(getattr(module, "__file__", None) or os.__file__):
+        return module.__name__.partition(".")[0]  # np.zeros, where np is the user's
+    frames = [
+        (str(frame.f_globals.get("__name__")).partition(".")[0], frame.f_code.co_name)
+        for frame, _ in walk_tb(error.__traceback__)
+    ]
+    last = max((at for at, (root, _) in enumerate(frames) if _ours(root)), default=-1)
+    called = [frame for frame in frames[last + 1 :] if frame[0] not in _IMPORTERS]
+    return next((root for root, what in called[:1] if failed or what == "<module>"), "")
+
+
+def _ours(root: str) -> bool:
+    return root in ("", "__main__", "beamline", *OWN_PACKAGES) or root.startswith("splatline")
+
+
+def of_library(frame: FrameType) -> bool:
+    """Whether code of Python or of an installed package of others runs in a frame."""
+    root = str(frame.f_globals.get("__name__")).partition(".")[0]
+    return not _ours(root) and _installed(_origin(root) or frame.f_code.co_filename)
+
+
+def _installed(file: str) -> bool:
+    """Whether a file lies where Python or pip puts modules."""
+    return file.startswith(os.path.dirname(os.__file__)) or any(  # noqa: PTH120
+        f"{os.sep}{folder}{os.sep}" in file for folder in ("site-packages", "dist-packages")
+    )
 
 
 def _origin(name: str) -> str | None:
@@ -63,6 +135,6 @@ _AGAIN = "Install it again: `pip install --force-reinstall --no-deps splatline`"
 
 def _way_out(origin: str) -> str:
     """What to do about a module that is not ours."""
-    if not any(f"{os.sep}{folder}{os.sep}" in origin for folder in ("site-packages", "dist-packages")):
+    if not _installed(origin):
         return "rename that one, or work in another folder"
     return "it belongs to another distribution. Install splatline in a separate environment (python -m venv)"

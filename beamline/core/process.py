@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -17,7 +18,7 @@ from typing import Any, Self, TextIO
 
 import psutil
 
-from beamline.core.errors import INTERRUPTED
+from beamline.core.errors import INTERRUPTED, ConfigError
 from beamline.core.stop import StopScope
 
 _POLL = 0.2  # real s between two questions whether the process should stop
@@ -26,6 +27,33 @@ SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 ORPHANED = "the process that started this one has died, so it ends, too; it has written no result"
 _LAST_WORK = 20.0  # real s that an orphan may take to notice
 _LAST_LINES = 5.0  # real s to read the last output of a killed process; its own child may hold the pipe open
+
+
+PYTHON = "BEAMLINE_PYTHON"  # in the environment: the program that runs parts of a scan, where a host runs Python
+
+
+class NoPythonError(ConfigError, OSError):
+    """No program is known that runs Python as this process does."""
+
+
+def python() -> str:
+    """The program that runs Python as this process does.
+
+    `sys.executable` is the host where Python is embedded in one, or empty. The host would start itself once more.
+
+    Raises:
+        NoPythonError: none was found.
+    """
+    inside = ("bin/python{}.{}".format(*sys.version_info), "python.exe", "Scripts/python.exe")
+    beside = [str(Path(prefix, name)) for prefix in (sys.prefix, sys.base_prefix) for name in inside]
+    programs = [each or "" for each in (sys.executable, getattr(sys, "_base_executable", ""), *beside)]
+    ours = (each for each in programs if re.search("(?i)python|pypy", Path(each).name) and Path(each).is_file())
+    if program := os.environ.get(PYTHON) or next(ours, None):
+        return program
+    raise NoPythonError(
+        f"Python runs inside another program here (sys.executable is {sys.executable!r}), and no program that runs it "
+        f"alone was found in {sys.prefix}. Set {PYTHON} to one that has splatline, such as C:/Python313/python.exe"
+    )
 
 
 class ProcessEnd(Enum):
@@ -68,6 +96,8 @@ class ChildProcess:
         behind: bool = False,
     ) -> None:
         self._on_line, self._on_end = on_line, on_end
+        if command[0] == sys.executable and (program := python()) != sys.executable:
+            command, environment = [program, *command[1:]], with_our_path()
         self._silent_since = time.monotonic()
         self._process = subprocess.Popen(
             list(command),

@@ -277,9 +277,21 @@ def _limits(facts: PlanFacts) -> Iterator[str]:
         taxi = f" (with {degrees(facts.views.taxi)} of taxi at each end)" if facts.views.taxi else ""
         yield (
             f"the stage would go from {degrees(low)} to {degrees(high)}{taxi}, its limits are "
-            f"{degrees(facts.stage.low)} ... {degrees(facts.stage.high)}; move or narrow the angles"
-            + (", or turn slower for less taxi" if facts.views.taxi else "")
+            f"{degrees(facts.stage.low)} ... {degrees(facts.stage.high)}; {' or '.join(_ways_within(facts))}"
         )
+
+
+def _ways_within(facts: PlanFacts) -> Iterator[str]:
+    """What brings the stage between its limits: another start, less to go, or less taxi by a longer period."""
+    (low, high), stage, views = facts.reach, facts.stage, facts.views
+    down, up = stage.low - low, stage.high - high  # by which all may move
+    if down <= up:
+        start = math.degrees(float(facts.plan.angles[0]) + (down if down > 0 else up))
+        yield f"begin at {start:.6g} degrees (scan.angles.start_deg)"
+    step, room = views.speed * views.period, views.taxi + min(-down, up)  # room for the taxi
+    if views.taxi and room > 2 * step:
+        yield f"set scan.period_s >= {rounded(step / math.sqrt(2 * stage.acceleration * (room - 2 * step)), up=True):g}"
+    yield "narrow the angles"
 
 
 def _rounding(facts: PlanFacts) -> Iterator[str]:

@@ -102,8 +102,8 @@ def tell_damaged(
     if damaged.any():
         taken = "left out" if used else "used as they are (--flags ignore)"
         warn(
-            f"Frames {spans(np.sort(frames[damaged]).tolist())} differ from their "
-            f"checksums: {taken}. Look for an intact copy of {source.path}."
+            f"{frames_text(np.sort(frames[damaged])).capitalize()}: another checksum than was written, "
+            f"{taken}. Look for an intact copy of {source.path}."
         )
     return lost | damaged if used else lost
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from beamline.core.durations import Phases
-from beamline.core.text import spans
+from beamline.core.text import frames_text
 from beamline.plan.passes import ended_by
 from beamline.projections.selection import Selection
 from beamline.reconstruct.region import RegionOfRows
@@ -55,7 +55,7 @@ def reasons(flags: FrameFlags) -> list[str]:
                 at = scored[np.argmax(np.abs(flags.scores[scored, i]))]
                 worst = f", worst {flags.scores[at, i]:.3g} {entry.unit} in frame {at}"
             name = f"{str(level).capitalize()} ({entry.name})"
-            lines.append(f"{name}: frames {spans(rows.tolist())}{worst}: {entry.meaning}.")
+            lines.append(f"{name}: {frames_text(rows)}{worst}: {entry.meaning}.")
     return lines
 
 
@@ -201,7 +201,7 @@ def facts_of(source: ScanSource, flags: FrameFlags | None = None) -> ScanFacts:
     table |= {str(k): as_text(v) for k, v in attributes.items() if len(str(v)) <= 200 and str(k) not in table}
     n, again = len(source.table), source.table.replaced
     if again.size:
-        table["views taken again"] = f"{again.size}, because of an alarm: frames {spans(again.tolist())} are not used"
+        table["views taken again"] = f"{again.size}, because of an alarm; not used: {frames_text(again)}"
     dropped = sum(int(decision.get("dropped") or 0) for decision in source.decisions)
     remarks = [*filter(None, [ended_by(source.decisions)]), *([] if flags is None else reasons(flags))]
     return ScanFacts(

@@ -115,7 +115,7 @@ def _of_block(taken: BlockTally) -> str:
         n = len(taken.missing)
         angles = np.degrees(block.angles[taken.missing])
         at = "" if np.isnan(angles).any() else f" (from {angles[0]:.4g}° to {angles[-1]:.4g}°)"
-        text = f"{n} of {block.n} {noun}s are missing: {spans(taken.missing)}{at}."
+        text = f"{n} of {block.n} {noun}s {'is' if n == 1 else 'are'} missing: {spans(taken.missing)}{at}."
         if taken.lost:
             text += (
                 f" {taken.lost} were exposed but never delivered by the camera: "

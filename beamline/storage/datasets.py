@@ -99,7 +99,7 @@ def arrays_in(file: h5py.File, dimensions: Sequence[int]) -> Iterator[h5py.Datas
 
 def first_of(item: h5py.Dataset) -> Any:
     """The first value of a dataset, which may have many; of an empty dataset nothing."""
-    return read_part(item, () if item.size <= 1 else (0,) * item.ndim)
+    return read_part(item, () if (item.size or 0) <= 1 else (0,) * item.ndim)
 
 
 def values_of(item: h5py.Dataset) -> Any:

@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from pathlib import Path
+from traceback import walk_tb
 from typing import Any, Literal
 
 import h5py
@@ -20,6 +21,7 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.files import no_file
+from beamline.core.installed import of_library
 from beamline.storage.disk_file import DiskFile, GrowingFile
 from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
@@ -184,12 +186,29 @@ def readable(path: Path) -> Iterator[None]:
     try:
         yield
     except ALTERED as error:
-        if isinstance(error, MemoryError | PermissionError | FileNotFoundError):
+        if isinstance(error, MemoryError | PermissionError | FileNotFoundError) or _of_our_own(error):
             raise
         what = " ".join(str(error).split()) or "no more is known"
         raise DataError(
             f"{path} is damaged, or its structure is unexpected ({type(error).__name__}: {what}). Nothing was changed."
         ) from error
+
+
+_CONTENT = r"array|bytes|unsized|'(Dataset|Datatype|Empty|Group|str)'"  # of a TypeError by what a file holds
+
+
+def _of_our_own(error: Exception) -> bool:
+    """Whether a mistake of a reader raised it, and no library that met what it did not expect.
+
+    A dataset where a group was expected lacks that group's attributes: the object is the file's then.
+    """
+    content = isinstance(
+        getattr(error, "obj", None), h5py.HLObject | h5py.Empty | np.ndarray | np.generic | str | bytes
+    )
+    of_type = isinstance(error, TypeError) and not re.search(_CONTENT, str(error))
+    mistake = of_type or isinstance(error, AttributeError | LookupError | AssertionError)
+    *_, (frame, _) = walk_tb(error.__traceback__)
+    return mistake and not content and not of_library(frame)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ import numpy as np
 
 from beamline.core.errors import DataError
 from beamline.core.files import atomic_file, no_file, refuse_existing, run_of
-from beamline.core.text import count, size, spans
+from beamline.core.text import count, frames_text, size
 from beamline.storage import hdf5
 from beamline.storage.disk_file import GrowingFile
 from beamline.storage.interrupted import n_still_to_take
@@ -67,14 +67,14 @@ class Recovered:
 
     def in_words(self) -> str:
         """The result as one line of text."""
-        wrong = f"; what it says of frames {spans(self.altered)} is not as it was written" if self.altered else ""
+        wrong = f"; with another record than was written: {frames_text(self.altered)}" if self.altered else ""
         if not self.changed:
             order = "cannot be mended" if wrong else "is in order"
             sentence = f"{self.path} {order}, with {count(self.frames, 'frame')}{wrong}; nothing was changed."
         else:
             gone = f", {count(self.dropped, 'frame')} not committed, left out" if self.dropped else ""
-            lost = f"; frames {spans(self.lost)} were committed and are not on the disk" if self.lost else ""
-            damaged = f"; frames {spans(self.damaged)} differ from their checksum" if self.damaged else ""
+            lost = f"; committed, but not on the disk: {frames_text(self.lost)}" if self.lost else ""
+            damaged = f"; with another checksum than was written: {frames_text(self.damaged)}" if self.damaged else ""
             views = f"; {count(self.missing, 'view')} of the plan not taken" if self.missing else ""
             sentence = f"{self.path}: {count(self.frames, 'frame')} recovered{gone}{lost}{damaged}{wrong}{views}."
         return f"{sentence} {self.remark}".strip()
@@ -89,11 +89,11 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
 
     Raises:
         DataError: no scan of this program, a damaged one, one that a running program has open, or that changed within
-            10 s; or the disk does not take the copy. Nothing is changed then.
+            10 s where the file system has no locks; or the disk does not take the copy. Nothing is changed then.
     """
     if not path.is_file():
         raise DataError(f"{no_file(path)} Nothing was changed.")
-    if held(path):
+    if in_use := held(path):
         raise DataError(
             f"{path} is open in a program that still runs: a scan that waits or pauses, or a reader. Let it end first. "
             "Nothing was changed."
@@ -108,10 +108,10 @@ def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovere
         if not head.open_for_writing and head.end == head.size:
             with suppress(*hdf5.ALTERED):  # its writer may have been killed when it added the view
                 return _with_view(path, head)
-        if head.open_for_writing and (age := abs(time.time() - path.stat().st_mtime)) < QUIET:
+        if in_use is None and head.open_for_writing and (age := abs(time.time() - path.stat().st_mtime)) < QUIET:
             raise DataError(
-                f"{path} changed {age:.0f} s ago and is marked as being written. If its writer is dead, try again in "
-                f"{QUIET:.0f} s. Nothing was changed."
+                f"{path} changed {age:.0f} s ago, is marked as being written, and its disk has no locks. If its "
+                f"writer is dead, try again in {QUIET:.0f} s. Nothing was changed."
             )
         free = size(shutil.disk_usage(path.parent).free)
         say(f"{path}: its frames are copied, which takes up to {size(head.size)} on its disk; {free} are free.")
@@ -160,7 +160,7 @@ def _copied(path: Path, head: Superblock, target: Path) -> Recovered:
                 if ending.status == RUNNING:
                     ending = ScanEnding("failed", gaps_in(path, made), DIED)
                 if lost:
-                    reason = f"{ending.reason} Frames {spans(lost)} were written and are not on the disk."
+                    reason = f"{ending.reason} Written, but not on the disk: {frames_text(lost)}."
                     ending = replace(ending, status="failed", reason=reason.strip())
                 state_ending(made, ending)
                 times = made[layout.TIME][()]

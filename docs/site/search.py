@@ -1,4 +1,4 @@
-"""Search of the built pages: prose first. Of the API reference names alone are searched, not its descriptions."""
+"""Search of the built pages: guides first, then other prose. Of the API names alone are searched, no descriptions."""
 
 from __future__ import annotations
 
@@ -6,15 +6,39 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mkdocs.exceptions import PluginError
 from mkdocs.plugins import event_priority
+
+GUIDES = ("Start", "Tutorials", "How to")
+"""Groups of the navigation whose pages come first. Before a guide comes none that has its word less than BOOST times
+as often."""
+BOOST = 4.0
+_ADD = "this.add(doc);"
 
 
 @event_priority(-100)  # after the search plugin has written its index
 def on_post_build(config: Any, **_: Any) -> None:
-    """Remove the text of the API reference from the index of the search."""
-    index = Path(config["site_dir"]) / "search" / "search_index.json"
-    content = json.loads(index.read_text(encoding="utf-8"))
+    """Remove the text of the API reference from the index of the search, and weigh guides."""
+    folder = Path(config["site_dir"]) / "search"
+    content = json.loads((folder / "search_index.json").read_text(encoding="utf-8"))
+    guides = tuple(page.replace(".md", ".html") for group in config["nav"] for page in _pages_of(group))
     for entry in content["docs"]:
         if entry["location"].startswith(("reference/", "public_names")):
             entry["text"] = ""
-    index.write_text(json.dumps(content), encoding="utf-8")
+        entry["boost"] = BOOST if entry["location"].partition("#")[0] in guides else 1.0
+    (folder / "search_index.json").write_text(json.dumps(content), encoding="utf-8")
+    worker = (folder / "worker.js").read_text(encoding="utf-8")
+    if worker.count(_ADD) != 1:
+        raise PluginError(
+            f"worker.js of mkdocs has {worker.count(_ADD)} times {_ADD!r}, expected once: guides get no boost"
+        )
+    weighed = worker.replace(_ADD, "this.add(doc, {boost: doc.boost});")
+    (folder / "worker.js").write_text(weighed, encoding="utf-8")
+
+
+def _pages_of(group: dict[str, Any]) -> list[str]:
+    """The pages of a group of the navigation if it holds guides."""
+    ((name, below),) = group.items()
+    if name not in GUIDES:
+        return []
+    return [below] if isinstance(below, str) else [page for each in below for page in each.values()]

@@ -93,10 +93,23 @@ def signals_waiting() -> Iterator[None]:
         yield
 
 
+class LibraryError(ImportError):
+    """A library of others cannot be loaded."""
+
+
 def loaded(module: str) -> Any:
-    """The module, as `importlib.import_module`; its first import ends before a signal is handled."""
+    """The module, as `importlib.import_module`; its first import ends before a signal is handled.
+
+    Raises:
+        LibraryError: the import of another project's module failed.
+    """
     with nullcontext() if module in sys.modules else signals_waiting():
-        return import_module(module)
+        try:
+            return import_module(module)
+        except Exception as error:
+            if module.partition(".")[0] in ("recon", "beamline") or isinstance(error, MemoryError):
+                raise
+            raise LibraryError(f"{module} cannot be loaded: {_one_line(str(error))}", name=module) from error
 
 
 class UnknownNameError(ValueError, KeyError):

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import llvmlite.binding as llvm
-from numba.core import caching
+from numba.core import caching, config
 from numba.core.compiler_lock import global_compiler_lock
 from numba.np.ufunc import parallel
 
@@ -129,8 +129,25 @@ _IMPORTED_IN = os.getpid()
 _loops = list[Any]()  # whose machine code lives as long
 
 
+_launched_by_numba = parallel._launch_threads
+
+
+def _launch() -> None:
+    """As numba; where the layer that NUMBA_THREADING_LAYER states cannot be had, with another one."""
+    try:
+        _launched_by_numba()
+    except ValueError as error:
+        stated, config.THREADING_LAYER = config.THREADING_LAYER, "default"
+        _launched_by_numba()
+        warnings.warn(
+            f"NUMBA_THREADING_LAYER={stated} in the environment is not used. Another layer is. Unset it "
+            f"({str(error).splitlines()[0]}).",
+            stacklevel=2,
+        )
+
+
 def _launch_threads() -> None:
-    """As numba, with the loop above before that of the threads."""
+    """As above, with the loop above before that of the threads."""
     if _loops:
         return
     process = _IMPORTED_IN if parallel._is_initialized else os.getpid()  # others may have launched them
@@ -151,5 +168,4 @@ def _forked() -> None:
         torch.set_num_threads(1)  # its OpenMP would wait, too
 
 
-if hasattr(os, "register_at_fork"):  # not on Windows
-    _launch, parallel._launch_threads = parallel._launch_threads, _launch_threads
+parallel._launch_threads = _launch_threads if hasattr(os, "register_at_fork") else _launch  # Windows has no forks

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from recon.base.declared_types import check_arguments, check_settings
 from recon.base.geometry import Geometry
 from recon.base.kernel import Kernel
-from recon.base.registry import loaded
+from recon.base.registry import LibraryError, loaded
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -164,7 +164,11 @@ def inverse_softplus(value: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def _tensor(values: NDArray[np.floating]) -> Tensor:
-    tensor: Tensor = loaded("torch").from_numpy(np.ascontiguousarray(values, np.float32).copy())
+    torch = loaded("torch")
+    try:
+        tensor: Tensor = torch.from_numpy(np.ascontiguousarray(values, np.float32).copy())
+    except RuntimeError as error:  # "Numpy is not available"
+        raise LibraryError(f"this torch was built for another numpy: {error}", name="torch") from error
     return tensor
 
 

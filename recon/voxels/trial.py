@@ -21,6 +21,7 @@ from recon.base.decisions import Decisions, Prior
 from recon.base.empirical import FEWEST_SUBSETS, FIRST_THRESHOLD, ONE_IN
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, ReconProblem, RunControl
+from recon.base.registry import LibraryError
 from recon.base.view_data import split_views
 from recon.base.volume import Grid, Volume
 from recon.voxels.choice import LEAST_GAIN, BestStrength, Prediction, TrialChoice, preferred_strength
@@ -329,7 +330,7 @@ class Trial:
                     if least_gain > 0 and choice.few_materials
                     else each.predict(self, choice) if isinstance(each, Predicting) else self.predicted(each)
                 )  # fmt: skip
-            except ValueError as error:
+            except (ValueError, LibraryError) as error:
                 prediction = Prediction(each.name, remark=f"{each.name}: {error}")
             choice = choice.after(prediction)
         return choice

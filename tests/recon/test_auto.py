@@ -13,6 +13,7 @@ import recon
 from recon.auto import Auto
 from recon.base.decisions import Decisions, Prior
 from recon.base.method import SWEEPS_OF_TRIALS, Method, ReconProblem, Reconstruction, RunControl
+from recon.base.registry import LibraryError, loaded
 from recon.base.view_data import Views
 from recon.base.volume import Volume
 from recon.methods import by_name
@@ -103,6 +104,22 @@ def test_a_method_that_does_not_take_the_views_is_left_out(data: F32) -> None:
     assert recon.reconstruct(data, VIEWS, Auto((Refusing(), Scaled()))).settings["factor"] == 1.0
     with pytest.raises(ValueError, match="fbp: not these"):
         recon.reconstruct(data, VIEWS, Auto((Refusing(),)))
+
+
+def test_a_method_whose_library_cannot_be_loaded_is_left_out(data: F32) -> None:
+    @dataclass(frozen=True)
+    class Lacking(Fbp):
+        def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
+            loaded("a_library_that_is_not_there")
+            raise AssertionError
+
+    because = recon.reconstruct(data, VIEWS, Auto((Scaled(), Lacking()))).settings["chosen_because"]
+    assert "fbp: a_library_that_is_not_there cannot be loaded: No module named" in because
+    few, views = data[:12], VIEWS.select(np.arange(0, 24, 2))
+    with pytest.warns(UserWarning, match="fbp is left out: a_library_that_is_not_there cannot be loaded"):
+        assert recon.reconstruct(few, views, Auto((Scaled(factor=2.0), Lacking()))).settings["factor"] == 2.0
+    with pytest.raises(LibraryError):
+        recon.reconstruct(few, views, Auto((Lacking(),)))
 
 
 @pytest.mark.parametrize("method", [Auto(), *(by_name(name)() for name in ("fista-tv", "pnp-dct", "discrete", "r2"))])

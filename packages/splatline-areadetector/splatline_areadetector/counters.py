@@ -108,7 +108,10 @@ def losses_told(gaps: Sequence[Gap], overflowed: Collection[int], counters: Coun
             else:
                 cause = counters.blame(gap)
             causes.setdefault(cause, []).append(i)
-    return [f"Frames {spans(ids)} were lost {cause}." for cause, ids in causes.items()]
+    return [
+        f"Frame{'s' * (len(ids) > 1)} {spans(ids)} {'were' if len(ids) > 1 else 'was'} lost {cause}."
+        for cause, ids in causes.items()
+    ]
 
 
 class Silence:

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 from threading import Event
 from typing import Any
 
@@ -114,7 +115,7 @@ def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[C
         first_worker_s: s to wait for the first worker.
 
     Raises:
-        ConfigError: no scheduler answers, or no worker comes in time.
+        ConfigError: no scheduler answers, no worker comes in time, or one has not the same version of splatline.
     """
     with ExitStack() as closing:
         closing.enter_context(dask.config.set({"distributed.admin.large-graph-warning-threshold": _TASK_SIZE_WARNING}))
@@ -143,4 +144,19 @@ def connected(spec: str, first_worker_s: float = _CONNECT_TIMEOUT) -> Iterator[C
                 f"--cluster {spec}: the scheduler has no workers, and none came in {first_worker_s:g} s. Start some: "
                 f"dask worker {spec}."
             ) from None
+        _require_same_version(client, spec)
         yield Cluster(max(1, _count(client)), client)
+
+
+def _require_same_version(client: Client, spec: str) -> None:
+    """Raises ConfigError if a worker lacks this package, or has another version of splatline."""
+    # A function of Python: a worker without this package has none of ours.
+    found = client.run(resolve_name, "splatline_cluster:recon.__version__", on_error="return")
+    others = {worker: there for worker, there in found.items() if there != recon.__version__}
+    for worker, there in others.items():
+        lacks = isinstance(there, Exception)
+        what = f"splatline or splatline-cluster cannot be loaded ({there})" if lacks else f"splatline is {there}"
+        raise ConfigError(
+            f"--cluster {spec}: {len(others)} of {len(found)} workers cannot take part: {what} at {worker}. Start the "
+            f"workers where splatline {recon.__version__} and splatline-cluster are installed. Nothing was read."
+        )

@@ -148,3 +148,36 @@ def test_workers_do_not_import_modules_of_the_current_folder(tmp_path: Path, mon
     (tmp_path / "string.py").write_text("raise SystemExit('a module of the current folder')")
     with connected("local:1") as cluster:
         assert cluster.workers == 1
+
+
+@pytest.mark.parametrize(
+    ("version", "told"),
+    [
+        ("0.9.0", "2 of 2 workers cannot take part: splatline is 0.9.0 at"),
+        (None, "2 of 2 workers cannot take part: splatline or splatline-cluster cannot be loaded (no version) at"),
+    ],
+)
+def test_workers_that_lack_this_version_are_named_before_the_work(two: Cluster, version: str | None, told: str) -> None:
+    def another() -> None:
+        def absent(name: str) -> str:
+            if name == "__version__":
+                raise ModuleNotFoundError("no version")
+            raise AttributeError(name)
+
+        vars(recon).pop("__version__", None)
+        vars(recon).update({"__version__": version} if version else {"__getattr__": absent})
+
+    def as_before() -> None:
+        import importlib
+
+        vars(recon).pop("__version__", None)
+        importlib.reload(recon)
+
+    two.client.run(another)
+    try:
+        with pytest.raises(ConfigError) as refused:
+            module._require_same_version(two.client, "local:2")
+        assert told in str(refused.value) and f"where splatline {recon.__version__} and" in str(refused.value)
+    finally:
+        two.client.run(as_before)
+    module._require_same_version(two.client, "local:2")

@@ -52,7 +52,13 @@ def reading(stamped: StampedValues, name: str) -> tuple[Any, float, tango.AttrQu
     quality = _RAISED.get(name, tango.AttrQuality.ATTR_VALID) if value else tango.AttrQuality.ATTR_VALID
     if stamp.severity is Severity.INVALID:
         quality = tango.AttrQuality.ATTR_INVALID
-    return list(value) if isinstance(value, tuple) else value, stamp.time, quality
+    shown = [latin(each) for each in value] if isinstance(value, tuple) else latin(value)
+    return shown, stamp.time, quality
+
+
+def latin(value: Any) -> Any:
+    """A text with "?" for each character that Tango's strings, which are Latin-1, lack; another value as it is."""
+    return value.encode("latin-1", "replace").decode("latin-1") if isinstance(value, str) else value
 
 
 @dataclass(frozen=True)
@@ -102,7 +108,7 @@ def device_class(run: FollowedRun, control: bool) -> type[Any]:
         "__doc__": "The newest run of a folder.",
         "init_device": init_device,
         "dev_state": lambda device: device_state(run.stamped.values),
-        "dev_status": lambda device: f"{run.stamped.values.state}; {run.stamped.values.message}",
+        "dev_status": lambda device: latin(f"{run.stamped.values.state}; {run.stamped.values.message}"),
     }
     for each in ATTRIBUTES:
         facts = {"doc": each.metadata["about"], "unit": each.metadata["unit"], **_TYPES[str(each.type)]}
@@ -137,7 +143,7 @@ def _send(run: FollowedRun, verb_of: Callable[[], Verb | Choice], command: str) 
     try:
         ask(newest(run.runs), verb_of())
     except (BeamlineError, OSError) as error:
-        tango.Except.throw_exception("SplatlineRefused", user_message(error), f"{_CLASS}.{command}")
+        tango.Except.throw_exception("SplatlineRefused", latin(user_message(error)), f"{_CLASS}.{command}")
 
 
 def serve(runs: Path, place: ServerPlace, control: bool, ready: Callable[[], None]) -> None:

@@ -21,7 +21,7 @@ from beamline.page.followed_run import FollowedRun, RunValues, StampedValues
 from beamline.scan.control import Verb
 from splatline_tango.device import ATTRIBUTES, ServerPlace, device_class, device_state, push, reading
 from tests.beamline.cli.small_scan import beamline
-from tests.beamline.features.run_folder import FAILED, write_run
+from tests.beamline.features.run_folder import FAILED, STARTED, write_run
 from tests.beamline.scans import TwoCylinders, frames_of
 from tests.free_ports import free_ports
 
@@ -112,6 +112,15 @@ def test_a_run_as_a_client_sees_it(served: tuple[FollowedRun, Path, Any]) -> Non
         device.Abort()
     with pytest.raises(tango.DevFailed, match="cannot be chosen now"):
         device.Decide("next")
+
+
+def test_characters_beyond_latin_1_do_not_end_the_server(served: tuple[FollowedRun, Path, Any]) -> None:
+    """Tango's strings are Latin-1."""
+    run, runs, device = served
+    write_run(runs / "2027-01-01T000000_b", {**STARTED, "sample": "Ω_µm_扫描"}, {**FAILED[-1], "message": "−1 €"})
+    run.look()
+    assert (device.SampleName, device.status()) == ("?_µm_??", "failed; ?1 ?")
+    assert reading(StampedValues(RunValues(flag_names=("θ", "°")), 1.0), "flag_names")[0] == ["?", "°"]
 
 
 def test_all_values_are_pushed(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def test_in_another_thread_a_request_stops_it_and_no_signal_is_caught(connected:
 
 def test_lost_frames_raise_what_the_command_says_and_leave_the_result(connected: Connected) -> None:
     with connected(FakeInstrument(Faults(lost={9}))) as instrument:
-        with pytest.raises(api.DataError, match="1 of 12 projections are missing"):
+        with pytest.raises(api.DataError, match="1 of 12 projections is missing"):
             instrument.scan()
         assert instrument.last is not None
         assert (instrument.last.missing, instrument.last.status, instrument.last.clean) == ((9,), "failed", False)

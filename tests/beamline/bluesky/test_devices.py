@@ -143,7 +143,7 @@ def test_lost_frames_fail_the_plan_and_are_named(engine: Any, tmp_path: Path) ->
         engine(fly(scan))
     said = "".join(map(str, [failed.value, failed.value.__cause__, *failed.value.args]))
     assert "LedgerError" in f"{failed.value!r} {failed.value.__cause__!r} {said}"
-    assert "1 of 12 projections are missing: 4" in said
+    assert "1 of 12 projections is missing: 4" in said
     assert heard.of("stop")[0]["exit_status"] == "fail"
 
 

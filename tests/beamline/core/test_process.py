@@ -10,7 +10,8 @@ from typing import Any
 import psutil
 import pytest
 
-from beamline.core.process import ChildProcess, ProcessEnd
+from beamline.core.errors import exit_code, user_message
+from beamline.core.process import ChildProcess, NoPythonError, ProcessEnd, python
 from tests.clock import wait_until
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without asking it")
@@ -165,3 +166,27 @@ def test_a_process_with_a_tether_ends_when_whoever_wanted_its_result_is_gone(
         process.stdin.close()
         assert process.wait(timeout=60) in (code, -2)  # -2: POSIX tells of an interrupt by its signal
         assert said in process.stderr.read()
+
+
+@pytest.mark.parametrize("host", ["lab_view", "", None])
+def test_a_host_program_is_not_started_again(host: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where Python runs inside another program, the one that belongs to it does the work, with the same imports."""
+    program = None if host is None else str(tmp_path / host) if host else ""
+    if host:
+        (tmp_path / host).write_text("", encoding="utf-8")
+    monkeypatch.setattr(sys, "executable", program)
+    monkeypatch.setattr(sys, "_base_executable", program, raising=False)
+    monkeypatch.syspath_prepend(str(tmp_path / "imports"))
+    lines: list[str] = []
+    with (tmp_path / "log").open("w") as log:
+        command: Any = [program, "-c", "import sys; print(sys.prefix, 'imports' in ' '.join(sys.path))"]
+        with ChildProcess(command, log, lines.append) as process:
+            assert process.wait(seconds=60) is ProcessEnd.EXITED
+    assert lines == [f"{sys.prefix} True\n"]
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.setattr(sys, "base_prefix", str(tmp_path))
+    with pytest.raises(NoPythonError, match="Set BEAMLINE_PYTHON") as refused:
+        python()
+    assert repr(program) in user_message(refused.value) and exit_code(refused.value) == 2
+    monkeypatch.setenv("BEAMLINE_PYTHON", "/opt/python")
+    assert python() == "/opt/python"

@@ -241,6 +241,25 @@ def test_advice_works_when_followed() -> None:
         assert worked(replace(PLAN, **changes | {"period": period})).violations == ()
 
 
+@pytest.mark.parametrize("start", [-5.0, 186.0])
+def test_a_start_within_the_limits_works_when_followed(start: float) -> None:
+    (violation,) = worked(replace(PLAN, angles=angles.fixed(360, start * DEG))).violations
+    advised = float(re.search(r"begin at (\S+) degrees", violation)[1])  # type: ignore[index]
+    assert worked(replace(PLAN, angles=angles.fixed(360, advised * DEG))).violations == ()
+    assert abs(advised - start) < 2
+
+
+def test_a_period_with_less_taxi_works_when_followed() -> None:
+    """Where no start is left: the range between the limits is 190 degrees, of which the views take 180."""
+    slow = replace(STAGE, low=-5 * DEG, high=185 * DEG, acceleration=20 * DEG)
+    plan = replace(PLAN, angles=angles.fixed(180, 0.0), period=0.05, exposure=0.01)
+    camera = replace(CAMERA, min_period=0.02)
+    (violation,) = worked(plan, slow, camera).violations
+    assert "begin at" not in violation
+    period = float(re.search(r"scan\.period_s >= ([\d.]+)", violation)[1])  # type: ignore[index]
+    assert worked(replace(plan, period=period), slow, camera).violations == () and period < 0.2
+
+
 @given(
     views=st.integers(2, 5000),
     passes=st.sampled_from([1, 2, 3]),

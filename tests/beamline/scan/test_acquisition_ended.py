@@ -168,7 +168,7 @@ def test_an_error_of_a_device_does_not_hide_what_was_lost_before_it() -> None:
     run = Run(instrument, instrument.timeline(n=12))
     assert isinstance(run.error, DeviceError) and "stopped short" in str(run.error)
     (told,) = run.warnings
-    assert told.startswith("1 of 12 projections are missing: 2 (from 30° to 30°). 1 were exposed but never delivered")
+    assert told.startswith("1 of 12 projections is missing: 2 (from 30° to 30°). 1 were exposed but never delivered")
     assert "1 frames came without a trigger" in told
 
 

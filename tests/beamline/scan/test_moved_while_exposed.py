@@ -151,7 +151,7 @@ def test_a_view_during_which_it_is_moved_is_taken_again(stage: str, disturb: str
 def test_one_that_is_moved_each_time_is_missing_and_named(kind: str, disturb: Disturb, tmp_path: Path) -> None:
     _, error, _, path = scanned(KINDS[kind], disturb, tmp_path, 3)
     assert isinstance(error, LedgerError) and error.missing == (FIRST + MOVED,)
-    assert "1 of 9 projections are missing: 4 (from 80° to 80°). In 1 of them the stage was not at its angle" in str(
+    assert "1 of 9 projections is missing: 4 (from 80° to 80°). In 1 of them the stage was not at its angle" in str(
         error
     )
     with h5py.File(path) as file:

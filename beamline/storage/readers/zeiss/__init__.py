@@ -46,9 +46,9 @@ class TxrmFile:
         self._ole = olefile.OleFileIO(path)
 
     def bytes_of(self, name: str) -> bytes:
-        """The content of a stream; KeyError if there is none."""
+        """The content of a stream; EOFError if there is none."""
         if not self._ole.exists(name):
-            raise KeyError(f"there is no stream {name}")
+            raise EOFError(f"there is no stream {name}")
         return bytes(self._ole.openstream(name).read())
 
     def numbers(self, name: str, dtype: str, n: int = 1) -> NDArray[Any] | None:
