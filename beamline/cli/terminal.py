@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Self, TextIO
+from typing import TYPE_CHECKING, Any, Self, TextIO
 
 import click
 from rich.console import Console
@@ -251,15 +251,16 @@ def results(record: ReconRecord) -> str:
     shape, seconds = " x ".join(str(n) for n in record.grid.shape), record.seconds_of_volumes
     several = "" if record.series is None else f"{record.series.n} of "
     span = f", {seconds[0]:.4g} to {seconds[-1]:.4g} s" if len(seconds) else ""
+    numbers: dict[str, Any] = dict(record.parameters)
     drawn = f" ({record.times['report']:.1f} s)" if record.times.get("report") else ""
     rows = {
         "output": record.output,
         "report": record.report and f"{record.report}{drawn}",
         "volumes" if several else "volume": f"{several}{shape} in {record.unit or 'volume fractions'}{span}",
         "axis_col": f"{record.axis_col:.2f}",
-        "cone": "magnification" in record.parameters
+        "cone": "magnification" in numbers
         and "magnification {magnification:.4g}, voxels of {voxel_mm:.4g} mm, fan of {fan_deg:.3g} degrees".format(
-            **record.parameters
+            **numbers
         ),
         "chosen": record.chosen,
     }

@@ -157,13 +157,13 @@ class AttributeGuide(_ByNumbers):
         self._name, self._seen = angles.name, False
 
     def phase(self, frame: ArrayFrame) -> Phase:
-        phase = super().phase(frame)
         self._seen = self._seen or self._name in frame.attributes
-        if phase.kind is _VIEWS and not self._seen:
-            raise ConfigError(_lacking("angles.name", self._name, frame))
-        return phase
+        return super().phase(frame)
 
     def angle(self, frame: ArrayFrame, trigger: int) -> float:
+        """ConfigError: neither this projection nor any frame before it has the attribute."""
+        if not self._seen:
+            raise ConfigError(_lacking("angles.name", self._name, frame))
         try:
             return _angle(float(frame.attributes[self._name]))
         except (KeyError, TypeError, ValueError):

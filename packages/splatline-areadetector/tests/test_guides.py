@@ -107,7 +107,7 @@ def test_kinds_by_order_and_by_attribute(tmp_path: Path) -> None:
     assert np.isnan(angles_told).all()
     lacking = guide_of(config_of(tmp_path, "pva://P:I", angles).ride)
     with pytest.raises(ConfigError, match="SampleRotary, an attribute that the frames do not have; they have ColorM"):
-        lacking.phase(_frame(9))
+        lacking.phase(_frame(9)), lacking.angle(_frame(9), 0)
     guide = guide_of(config_of(tmp_path, "pva://P:I", angles, kinds="K").ride)
     told = [guide.phase(_frame(i, SampleRotary=1.0, K=word)) for i, word in enumerate(("flat", "data", "x", ""))]
     assert told == [Phase(0, FrameKind.FLAT), Phase(0, FrameKind.PROJECTION), NO_SCAN, NOT_TOLD]

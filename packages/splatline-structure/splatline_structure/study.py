@@ -85,7 +85,7 @@ def study_structure(
                 )
             axis_col = record.axis_col
             try:
-                box = box or box_in(record.volume.data, True)
+                box = box or box_in(record.volume.data, "square")
                 slices = slice(0, record.grid.shape[0])
                 read = ReadSlices(record, slices, slices, slices.stop)
                 series[n] = measured(scan, read, box, answer, **values).found.intervals

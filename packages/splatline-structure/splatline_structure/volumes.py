@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 import recon
@@ -119,8 +119,8 @@ def read_volume(
             raise DataError(
                 f"{path}: {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels take {size(needed)}, and "
                 f"{size(memory)} may be used{' for each of several volumes' if whole else ''}. Free memory, give more "
-                f"--memory{', fewer --slices' if whole else ''}{', --crop square' if crop == 'none' else ''}, or measure "
-                "a part of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
+                f"--memory{', fewer --slices' if whole else ''}{', --crop square' if crop == 'none' else ''}, or "
+                "measure a part of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
             )
         excess = max(end - first - most, 0)
         fitting = slice(first + excess // 2, end - (excess - excess // 2))
@@ -188,7 +188,7 @@ def box_in(volume: F32, crop: Crop) -> Box:
     nz, ny, nx = volume.shape
     if crop == "none":
         return slice(0, nz), slice(0, ny), slice(0, nx)
-    known = np.isfinite(volume).all(axis=0)
+    known: NDArray[np.bool_] = np.isfinite(volume).all(axis=0)
     if crop == "finite" and not known.all():
         box = inscribed_box((nz, ny, nx), sample_circle(known[None].astype(np.float32)), 0.0)
         if not known[box[1:]].all():
