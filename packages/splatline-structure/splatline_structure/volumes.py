@@ -188,7 +188,7 @@ def box_in(volume: F32, crop: Crop) -> Box:
     nz, ny, nx = volume.shape
     if crop == "none":
         return slice(0, nz), slice(0, ny), slice(0, nx)
-    known: NDArray[np.bool_] = np.isfinite(volume).all(axis=0)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(volume).all(axis=0))
     if crop == "finite" and not known.all():
         box = inscribed_box((nz, ny, nx), sample_circle(known[None].astype(np.float32)), 0.0)
         if not known[box[1:]].all():
