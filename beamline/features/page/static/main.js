@@ -303,8 +303,9 @@ function header(now) {
   const word = now.over ? now.status : state || now.status, chip = $("state"), told = now.next || ended;
   if (told !== nextStep) $("said").textContent = nextStep = told;
   chip.textContent = word; chip.className = `chip ${COLOURS[word] || ""}`;
-  $("done").value = planned ? now.frames / planned : now.status === "running" ? 0 : 1;
-  const shown = { frames: planned ? `${now.frames} stored, ${Math.max(ledger.exposed, now.frames)} exposed, ${planned} planned` : `${now.frames}` };
+  const of = planned >= now.frames ? planned : 0;  // the newest part of a run plans its own frames, and a joined file has those of all
+  $("done").value = of ? now.frames / of : now.status === "running" ? 0 : 1;
+  const shown = { frames: of ? `${now.frames} stored, ${Math.max(ledger.exposed, now.frames)} exposed, ${of} planned` : `${now.frames}` };
   if (rate && now.status === "running") {
     shown.rate = `${rate.frames_per_s.toFixed(1)} frames/s, ${rate.mb_per_s.toFixed(1)} MB/s`;
     if (rate.eta_s !== null) shown.left = duration(rate.eta_s);
