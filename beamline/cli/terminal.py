@@ -226,7 +226,8 @@ def fit(at: FitReached) -> str:
     parts += [f"{at.n_gaussians} Gaussians"] if at.n_gaussians else []
     errors = {"residual": at.residual, "held out": at.held_out}
     parts += [f"{name} {error:.4f}" for name, error in errors.items() if error is not None and math.isfinite(error)]
-    parts += [] if at.eta_s is None else [f"{timedelta(seconds=round(at.eta_s))} left"]
+    left = "left for these" if at.unit else "left"  # other parts of the work may follow
+    parts += [] if at.eta_s is None else [f"{timedelta(seconds=round(at.eta_s))} {left}"]
     return ", ".join(parts)
 
 

@@ -155,7 +155,7 @@ class StampedValues:
         frame = Stamp(now if seen["newest"] is None else float(seen["newest"]))
         taken: dict[str, Any] = {"stored": stored, "angle": angle, "free": seen["free"] / 1e9, "age": seen["age_s"]}
         taken["exposed"] = max(before.exposed, stored)  # not every frame has an event
-        taken["percent"] = 100.0 * stored / before.planned if before.planned > 0 else before.percent
+        taken["percent"] = 100.0 * stored / max(before.planned, stored) if before.planned > 0 else before.percent
         taken["skipped"] = seen.get("skipped_lines", 0)
         stamps = {**self.stamps, **dict.fromkeys(_OF_FILE, frame), "free": Stamp(now), "age": Stamp(now)}
         ended = status == DIED or seen.get("over") or (not before.run and status != "running")  # as no log may say

@@ -124,6 +124,8 @@ MOST_PASSES = 100
 """Most passes of a step scan: each holds the numbers of all views that it does not take."""
 ROOM = 1.1
 """Required free disk, as a multiple of pixels and previews: values of each frame and other files grow meanwhile."""
+CLOSING = 20_000_000
+"""Bytes that a file may take to be closed, with its /exchange view: a scan with less beside its frames pauses."""
 MARGIN = 1.01
 """Trigger period over the camera's least, below which jitter may cost frames (tomoscan's smallest camera margin)."""
 
@@ -173,9 +175,10 @@ def violations(facts: PlanFacts) -> Iterator[str]:
             f"set it to at least {math.ceil(plan.n_views / MOST_PASSES)}, or to 0"
         )
     needed = facts.total_bytes + facts.retake_bytes
-    if facts.free_bytes is not None and needed * ROOM > facts.free_bytes:
+    if facts.free_bytes is not None and needed * ROOM + CLOSING > facts.free_bytes:
         yield (
-            f"the file needs {size(needed)} and a tenth more, the disk has {size(facts.free_bytes)} free; "
+            f"the file needs {size(needed)} and a tenth more, and {size(CLOSING)} to be closed; the disk has "
+            f"{size(facts.free_bytes)} free; "
             "free some, choose another storage.folder, or reduce views, roi or binning"
         )
 

@@ -63,7 +63,7 @@ def progress_events(
         made, spent = progress.step - first.step, progress.seconds - first.seconds
         rate = made / spent if made > 0 and spent > 0 else None
         eta = None
-        if progress.steps and "trial" not in progress.unit:  # which may end early
+        if progress.steps:  # of this part of the work alone
             eta = seconds_left(made, progress.steps - first.step, spent)
         elif seconds is not None and not progress.unit:
             eta = max(0.0, seconds - spent)

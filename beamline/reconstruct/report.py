@@ -55,6 +55,7 @@ def compose(
         metrics={label_of(method): values for method, values in metrics.items()},
         frames=context.facts.frames,
         flags=[*context.facts.remarks, *context.warnings],
+        done=[each.sentence for each in prepared.done.values() if each.sentence and not each.warned],
         pictures=[
             *(_slices(prepared, truth, volumes) if made.series is None else _several(made.series)),
             *_doubts(made, prepared, judgement.unexplained),

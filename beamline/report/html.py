@@ -39,6 +39,7 @@ class Report:
         frames: frames in the file of those planned, e.g. "90/90".
         flags: remarks of the monitor, facts among them, and of the reconstruction; `scan` counts the flagged frames.
         recipe: its options that hold for other scans; empty: none are shown.
+        done: what was found in the views, and what was done with them, where nothing is wrong.
         footnotes: definitions that the metrics need.
         volume: name of the volume's file, in the folder of the page; empty: it was not written.
         live_picture: name of the picture of the growing volume, in the folder of the page; empty: no picture.
@@ -53,6 +54,7 @@ class Report:
     flags: Sequence[str]
     pictures: Sequence[Picture]
     command: str
+    done: Sequence[str] = ()
     footnotes: Sequence[str] = ()
     recipe: str = ""
     volume: str = ""

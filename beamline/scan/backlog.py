@@ -11,6 +11,7 @@ from beamline.core.events import FrameStored
 from beamline.core.machine import free_memory
 from beamline.core.stop import Cause, PauseRequest
 from beamline.core.text import count, size
+from beamline.plan.limits import CLOSING
 from beamline.plan.plan import Timeline
 from drivers.base.frame import Frame
 from drivers.frame_memory import FrameMemory
@@ -18,7 +19,6 @@ from drivers.frame_memory import FrameMemory
 WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
 WAITING_FRAMES = (4, 128)  # least and most frames
 CHECKED_FRAMES = 2  # most frames that wait between the recorder's threads
-CLOSING = 20_000_000  # bytes that a file may take to be closed, with its /exchange view
 EVENT_INTERVAL = 0.1  # real s between `frame` events
 RATE_FRAMES = 20  # the rate is that of the last so many frames
 

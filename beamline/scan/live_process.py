@@ -178,13 +178,18 @@ class LiveReconstruction:
             self.ended = True
             self._sink(Warned(f"The {self._what} could not be started ({error}). The scan is not affected."))
 
-    def wait_ready(self, seconds: float, stop: Callable[[], bool]) -> None:
+    def wait_ready(self, seconds: float, stop: Callable[[], bool], say: Callable[[str], None]) -> None:
         """Wait until it has compiled its kernels or ended, `stop` returns True, or the timeout (s of real time) has
-        passed.
+        passed; `say` is told what the scan waits for.
 
         A time-out is a warning: the scan need not wait for it.
         """
         deadline = time.monotonic() + seconds
+        if not self._ready.is_set():
+            say(
+                "Waiting until the live reconstruction has compiled its kernels (once on a machine 1 to 2 minutes, "
+                f"otherwise seconds; at most {seconds:.0f} s). A pause begins after this wait; a stop ends it"
+            )
         while self._process is not None and self._process.running and not stop():
             if self._ready.wait(_POLL):
                 return

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Protocol
 
@@ -212,8 +212,8 @@ class Measurement:
     def _acquire(
         self, acquisition: FrameSource, recorder: Recorder, labels: LabelLog, follower: LiveReconstruction | None
     ) -> None:
-        if self.config.simulation is None and follower is not None and self.source_of is None:
-            follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
+        if self.config.simulation is None and self.source_of is None:
+            self._wait_for(follower)
         # Closing the iterator is what makes the instrument safe when the recorder fails.
         with closing(acquisition.frames()) as frames:
             for frame in frames:
@@ -221,6 +221,12 @@ class Measurement:
                 if self.instrument.simulated is not None:
                     labels.add(frame.index, self.instrument.simulated.labels(frame.time))
                 recorder.put(frame)
+
+    def _wait_for(self, follower: LiveReconstruction | None) -> None:
+        """Wait until the live reconstruction is ready for views."""
+        if follower is not None:
+            say = partial(self.states.enter, self.states.state)
+            follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping, say)
 
     def _recorder(self, writer: NXtomoWriter) -> Recorder:
         monitor = self.config.monitor
@@ -267,8 +273,8 @@ class Measurement:
     def _refusal(self, recorder: Recorder, follower: LiveReconstruction | None) -> str | None:
         """Why no projection should be taken after these darks and flats; None: no fault, or faults are only logged."""
         recorder.wait()
-        if self.config.simulation is not None and follower is not None:
-            follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping)
+        if self.config.simulation is not None:
+            self._wait_for(follower)
         if self.stop.stopping:
             return None
         blocks = self.ready.timeline.blocks

@@ -35,7 +35,7 @@ class Run:
         sample: its name.
         time: s since the Unix epoch, when it began.
         frames: in its files; None: not known.
-        planned: frames that the first part was to have; None: not known.
+        planned: frames of the parts before the newest one, and those that it was to have; None: not known.
         ended: who ended it before its plan by a choice, and why; "" if nobody did.
         flags: frames that the monitor flagged: their number by check, then by level.
         state: of its newest part, see docs/states.md; `died` if its process ended without writing its last one.
@@ -83,9 +83,10 @@ def describe(run: Path) -> Run:
     parts = [run, *(part for part in parts_of(run)[1:] if is_below(part, EVENTS))]  # which comes after its record
     records = [record_of(part) for part in parts]
     frames: int | None = 0
+    earlier = frames  # of the parts before the newest one
     flags: dict[str, dict[str, int]] = {}
     for record in records:
-        before = 0 if record.joined else frames
+        before, earlier = 0 if record.joined else frames, frames
         frames = None if record.frames is None or before is None else before + record.frames
         for check, levels in record.flags.items():
             flags[check] = dict(Counter(flags.get(check)) + Counter(levels))
@@ -95,7 +96,7 @@ def describe(run: Path) -> Run:
         sample=records[0].sample or run.name.partition("_")[2] or run.name,
         time=_began(run),
         frames=frames,
-        planned=records[0].planned,
+        planned=None if records[-1].planned is None or earlier is None else earlier + records[-1].planned,
         flags=flags,
         state=state,
         bytes=sum(_size(Path(at, name)) for at, _, names in os.walk(run) for name in names),

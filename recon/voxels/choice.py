@@ -32,10 +32,12 @@ MOST_TRIALS = (2 + _OCTAVES) / TRIALS
 def exceeds_standard_error(gains: F64, errors: float) -> bool:
     """Whether the mean gain [view held out] exceeds `errors` of its standard errors. False: a gain is not finite, as a
     candidate was ended, or diverged."""
-    if not np.isfinite(gains).all():
-        return False
-    scatter = float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
-    return float(gains.mean()) > errors * scatter
+    return bool(np.isfinite(gains).all()) and float(gains.mean()) > errors * _standard_error(gains)
+
+
+def _standard_error(gains: F64) -> float:
+    """Of the mean gain [view held out]; 0 of one view."""
+    return float(gains.std(ddof=1)) / math.sqrt(gains.size) if gains.size > 1 else 0.0
 
 
 def predicts_as_well(residuals: F64, best: F64) -> bool:
@@ -140,14 +142,27 @@ class TrialChoice(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """Where it was tried, with all residuals (of weighed rays; the data residual is a share of the views) and
-        remarks."""
+        """Where it was tried, with all residuals (of weighed rays; the data residual is a share of the views), remarks,
+        and why a simpler candidate than the best is taken."""
         if self.at is None:
             return self.where
         given = [(each.name, np.mean(each.residuals)) for each in self.predictions if each.residuals is not None]
-        listed = [f"{name} {mean:.4g}" for name, mean in given]
+        listed = [f"{name} {mean:#.4g}" for name, mean in given]
         remarks = [each.remark for each in self.predictions if each.remark]
-        return f"trials on {self.where}, {_MEASURE}: {'; '.join([*listed, *remarks])}"
+        return f"trials on {self.where}, {_MEASURE}: {'; '.join([*listed, *remarks])}{self._of_the_best}"
+
+    @property
+    def _of_the_best(self) -> str:
+        """By how much the best is better than a simpler one that is taken; empty where the best is taken."""
+        if self.at is None or self.best is None or self.at == self.best:
+            return ""
+        (simple, mine), (best, least) = ((self.predictions[at].name, self.tried[at]) for at in (self.at, self.best))
+        less, error = ((mine - least).mean() / mine.mean(), _standard_error(mine - least) / mine.mean())
+        by = f"{self.least_gain:.2%} less, and less " if self.least_gain else "less "
+        return (
+            f". {best} leaves {less:.2%} less than {simple}, with a standard error of {error:.2%}. {simple} is taken, "
+            f"because it is simpler, and a costlier method must leave {by}by more than one standard error"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -197,7 +197,10 @@ class FrameStream:
             return self._context.get(self.name, timeout=within, request=request or None)
         except TimeoutError:
             raise DeviceTimeout(
-                self.name, f"no answer within {within:g} s", advice=UNREACHABLE, state="Nothing was asked"
+                self.name,
+                f"no answer within {within:g} s",
+                advice=UNREACHABLE,
+                state="It was only asked, and nothing was changed",
             ) from None
         except RemoteError as error:
             raise ConfigError(f"{self.name} refuses to be read: {error}. Nothing was started.") from None

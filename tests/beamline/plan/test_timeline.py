@@ -291,10 +291,10 @@ def test_no_trigger_output_and_no_room() -> None:
     (violation,) = worked(stage=replace(STAGE, trigger_output=False)).violations
     assert "no trigger output" in violation
     # 410 frames of 144 x 252 px, 2 bytes a pixel and 4 a block of 4 x 4 pixels, or for each pixel.
-    (violation,) = worked(free_bytes=36_000_000).violations
-    assert "needs 33.5 MB and a tenth more, the disk has 36 MB free" in violation
-    assert worked(free_bytes=37_000_000).violations == ()
-    (violation,) = worked(free_bytes=90_000_000, preview_bin=1).violations
+    (violation,) = worked(free_bytes=56_000_000).violations
+    assert "needs 33.5 MB and a tenth more, and 20 MB to be closed; the disk has 56 MB free" in violation
+    assert worked(free_bytes=57_000_000).violations == ()
+    (violation,) = worked(free_bytes=110_000_000, preview_bin=1).violations
     assert "needs 89.3 MB and a tenth more" in violation
 
 

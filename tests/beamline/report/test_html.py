@@ -65,6 +65,12 @@ def test_remarks_are_counted_and_listed() -> None:
     assert "No remarks" in "".join(parsed_page(to_html(_report())).text)
 
 
+def test_what_was_done_is_listed_also_where_nothing_is_wrong() -> None:
+    text = "".join(parsed_page(to_html(_report(done=["Phase: a filter over <2> pixels."]))).text)
+    assert "No remarks" not in text and "No warnings" in text
+    assert "Phase: a filter over <2> pixels." in text
+
+
 def test_report_is_whole_and_never_overwrites(tmp_path: Path) -> None:
     path = tmp_path / "report.html"
     write_report(path, _report())

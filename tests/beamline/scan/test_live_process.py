@@ -11,6 +11,7 @@ import pytest
 
 from beamline.core.errors import ScanStopped
 from beamline.core.events import Event
+from beamline.core.files import CONTROL
 from beamline.core.process import ChildProcess, ProcessEnd
 from beamline.core.recon_events import LawMeasured
 from beamline.core.run_result import RunResult
@@ -36,6 +37,7 @@ def test_what_it_leaves_out_is_told_to_the_follower() -> None:
     assert words[words.index("--follow") :][:5] == ["--follow", "--previous-part", "a.h5", "--previous-part", "b.h5"]
 
 
+WAITS = "Waiting until the live reconstruction has compiled its kernels"
 READY = """print('{"event": "state", "state": "ready", "message": ""}', flush=True)\n"""
 
 
@@ -83,11 +85,30 @@ while "{waits_for}" not in events.read_text():
     blocks = [i for i, (name, _) in enumerate(names) if name == "block_started"]
     views = next(i for i in blocks if ran.events[i].data["kind"] == "projection")
     warned = any("not ready after 0 s" in text for text in ran.warnings)
+    told = [i for i, event in enumerate(ran.events) if WAITS in event.data.get("message", "")]
+    assert all(blocks[0] < i < views and ran.events[i].data["state"] == "flats" for i in told)
+    assert len(told) == 1 or not warned  # one that is ready by then is not waited for
     assert warned == (patience == 0)
     assert warned or names.index(("state", "ready")) < views
     assert blocks[0] < views  # darks and flats of a simulated instrument are taken meanwhile
     if not warned:
         assert blocks[0] < names.index(("state", "ready"))
+
+
+def test_a_pause_that_is_asked_for_in_the_wait_is_taken_back(tmp_path: Path) -> None:
+    def pause_and_resume(event: Event) -> None:
+        if WAITS in event.data.get("message", ""):
+            run = next(tmp_path.glob("*/"))
+            for verb in ("pause", "resume"):
+                (run / CONTROL / verb).touch()
+                wait_until(lambda: not (run / CONTROL / verb).exists())  # noqa: B023
+            (run / "go").touch()
+
+    wait = "import pathlib, sys, time\nwhile not pathlib.Path(sys.argv[1]).with_name('go').exists(): time.sleep(0.05)\n"
+    ran = Ran(tmp_path, FakeInstrument(), live=script(wait + READY, ready=""), heard=pause_and_resume)
+    assert ran.error is None
+    assert "paused" not in [event.data.get("state") for event in ran.events]
+    ran.assert_good_file(19, "complete")
 
 
 def test_a_stop_ends_the_wait_for_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from beamline.core.errors import ConfigError, DataError
 from beamline.core.events import Event
 from beamline.scan.control import State, running
 from beamline.scan.resume import NoFrame, open_for_resume, recover_run
-from beamline.scan.runs import describe, newest, runs_in
+from beamline.scan.runs import cells, describe, newest, runs_in
 from beamline.storage import writer_lock
 from beamline.storage.run_record import RecordFile, RunRecord, read_record, write_record
 from tests.beamline.fakes import FakeInstrument
@@ -69,10 +69,18 @@ def test_parts_of_a_resumed_run_are_one_run(tmp_path: Path) -> None:
     _part(run / "part-2", later)
     found = describe(run)
     assert runs_in(tmp_path) == [run]
-    assert (found.frames, found.parts, found.state, found.planned) == (22, 2, "done", 20)
+    assert (found.frames, found.parts, found.state, found.planned) == (22, 2, "done", 9 + 13)
     assert found.flags == {"mass": {"warn": 3, "alarm": 4}}
     write_record(run / "part-2", replace(later, state=State.ACQUIRING, over=False, frames=5))
     assert (describe(run).frames, describe(run).state) == (9 + 5, "died")
+
+
+def test_a_run_never_has_more_frames_than_planned(tmp_path: Path) -> None:
+    """Each part takes darks and flats again, so that a run of three parts takes more than its first one was to take."""
+    run = _part(tmp_path / "2026-01-02T03-04-05_a", RunRecord(State.STOPPED, True, "a", 48, planned=120))
+    _part(run / "part-2", RunRecord(State.STOPPED, True, "a", 90, True, 92))
+    _part(run / "part-3", RunRecord(State.STOPPED, True, "a", 122, True, 70))
+    assert "122 of 160 in 3 parts" in cells(describe(run))
 
 
 def test_newest_first_also_within_a_second(tmp_path: Path) -> None:

@@ -106,6 +106,19 @@ def test_a_choice_names_the_best_and_what_chance_does_not_tell_from_it() -> None
     assert verdicts(ended) == [""]
 
 
+def test_a_choice_says_why_the_lowest_residual_is_not_taken() -> None:
+    def reason(gain: float, least_gain: float, scatter: NDArray[np.float64] = 0 * SCATTER) -> str:
+        given = (Prediction(name, left.tolist()) for name, left in (("tv", 1 + scatter), ("r2", 1 - gain - scatter)))
+        return TrialChoice("16 rows", least_gain, tuple(given)).reason
+
+    small = reason(0.004, 0.02)
+    assert "tv 1.000; r2 0.9960. r2 leaves 0.40% less than tv, with a standard error of 0.00%. tv is taken" in small
+    assert small.endswith("a costlier method must leave 2.00% less, and less by more than one standard error")
+    by_chance = reason(1e-5, 0.0, SCATTER)
+    assert "tv is taken" in by_chance and by_chance.endswith("must leave less by more than one standard error")
+    assert reason(0.1, 0.02).endswith("tv 1.000; r2 0.9000")
+
+
 def test_a_choice_is_the_same_from_a_file() -> None:
     """Other slabs of a volume follow that of the first one."""
     choice = TrialChoice("16 rows", 0.02)
@@ -117,7 +130,7 @@ def test_a_choice_is_the_same_from_a_file() -> None:
         choice = choice.after(prediction)
     assert (choice.at, choice.prior) == (2, None)
     assert choice.reason.startswith("trials on 16 rows, root mean square left of views held out")
-    assert choice.reason.endswith("fista-tv 2; r2 1; fbp: not these; r2 stopped")
+    assert choice.reason.endswith("fista-tv 2.000; r2 1.000; fbp: not these; r2 stopped")
     again = TrialChoice.of(json.loads(json.dumps(choice)))
     assert (again.at, again.reason) == (choice.at, choice.reason)
     assert again.predictions[1].prior == Prior(0.1)

@@ -8,7 +8,7 @@ const KINDS = { "-1": "alignment", 0: "projection", 1: "flat", 2: "dark", 3: "in
 const COLOURS = { done: "good", complete: "good", paused: "warn", asking: "warn", stopped: "warn", finishing: "busy", acquiring: "busy", darks: "busy", flats: "busy", taxi: "busy", preparing: "busy", aborted: "bad", failed: "bad", died: "bad" };
 const columns = { kind: [], angle: [], time: [], mean: [] };
 const curves = { trace: { x: [], y: [] }, rate: { x: [], y: [] }, beam: { x: [], y: [], unit: "" }, residual: { x: [], y: [] }, error: { x: [], y: [] } };
-let facts = null, frames = 0, planned = 0, current = 0, flags = [], state = "", region = null, volume = null, volumeKey = null, ended = "", rate = null, lastSeen = Date.now(), plot = null, ledger = { exposed: 0 }, fit = null;
+let facts = null, frames = 0, planned = 0, current = 0, flags = [], state = "", region = null, volume = null, volumeKey = null, ended = "", rate = null, lastSeen = Date.now(), plot = null, ledger = { exposed: 0 }, fit = null, work = null, pausing = false;
 
 // --- frame -------------------------------------------------------------------------------------------------------
 const frameWindows = {};  // of a kind of frame, so that flats and views each keep theirs
@@ -227,13 +227,13 @@ function onRun(event) {
   const data = JSON.parse(event.data), live = data.source === "recon";
   switch (data.event) {
     case "run_started": planned = data.n_frames; log(data, `Scan of ${data.sample}: ${data.n_frames} frames planned`); break;
-    case "state": if (!live) { state = data.state; $("message").textContent = data.message; $("said").textContent = ""; if (state === "finishing") passes.finish(); } log(data, `${live ? "volume: " : ""}${data.state.replaceAll("_", " ")}${data.message ? `: ${data.message}` : ""}`); break;
+    case "state": if (!live) { state = data.state; if (["paused", "finishing"].includes(state)) pausing = false; $("message").textContent = data.message; $("said").textContent = ""; if (state === "finishing") passes.finish(); } log(data, `${live ? "volume: " : ""}${data.state.replaceAll("_", " ")}${data.message ? `: ${data.message}` : ""}`); break;
     case "frame": rate = data; ledger.exposed = Math.max(ledger.exposed, data.n); curves.rate.x.push(data.n); curves.rate.y.push(data.frames_per_s); break;
     case "flag": advice.push(data); logFlag(data); break;
     case "beam": curves.beam.unit = data.unit; curves.beam.x.push(data.read_at - (curves.beam.start ??= data.read_at)); curves.beam.y.push(data.value); break;
     case "slices": $("coverage").textContent = `${data.n_views} views${data.degrees < 179 ? `, ${data.degrees.toFixed(0)} of 180 degrees so far` : ""}`; fetchModel(); break;
     case "snapshot": if (data.errors) point(curves.error, data.n_views, Math.min(...Object.values(data.errors).filter((error) => error !== null))); break;
-    case "progress": if (data.n_gaussians) fit = { ...data, views: Math.max(1, data.n_views) }; if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
+    case "progress": if (data.steps !== undefined) work = data; if (data.n_gaussians) fit = { ...data, views: Math.max(1, data.n_views) }; if (data.residual !== null && data.n_views) point(curves.residual, data.n_views, data.residual); break;
     case "pass_ended": passes.end(data); log(data, `Pass ${data.passes ?? data.number} is over, ${data.n_views} views so far`); break;
     case "next_chosen": if (data.choice === "enough") ended = `Ended after pass ${data.passes ?? data.number} by the choice enough of the ${data.by}: ${data.reason}. ${data.dropped ?? 0} planned frames were not taken.`; passes.choose(data); log(data, `After pass ${data.passes ?? data.number}: ${data.choice}, by the ${data.by}: ${data.reason}`); break;
     case "block_done": log(data, `${data.frames} of ${data.n} ${data.kind} frames taken${data.missing.length ? `, ${data.missing.length} missing` : ""}`, data.missing.length ? "warning" : ""); break;
@@ -302,9 +302,10 @@ let nextStep = "";  // for a scan that has died or ended early
 function header(now) {
   const word = now.over ? now.status : state || now.status, chip = $("state"), told = now.next || ended;
   if (told !== nextStep) $("said").textContent = nextStep = told;
-  chip.textContent = word; chip.className = `chip ${COLOURS[word] || ""}`;
-  $("done").value = planned ? now.frames / planned : now.status === "running" ? 0 : 1;
-  const shown = { frames: planned ? `${now.frames} stored, ${Math.max(ledger.exposed, now.frames)} exposed, ${planned} planned` : `${now.frames}` };
+  chip.textContent = pausing && !now.over ? `${word}, pause sent` : word; chip.className = `chip ${COLOURS[word] || ""}`;
+  const of = planned >= now.frames ? planned : 0;  // the newest part of a run plans its own frames, and a joined file has those of all
+  $("done").value = of ? now.frames / of : now.status === "running" ? 0 : 1;
+  const shown = { frames: of ? `${now.frames} stored, ${Math.max(ledger.exposed, now.frames)} exposed, ${of} planned` : `${now.frames}` };
   if (rate && now.status === "running") {
     shown.rate = `${rate.frames_per_s.toFixed(1)} frames/s, ${rate.mb_per_s.toFixed(1)} MB/s`;
     if (rate.eta_s !== null) shown.left = duration(rate.eta_s);
@@ -312,12 +313,12 @@ function header(now) {
   if (now.status === "running") shown["last frame"] = `${now.age_s.toFixed(0)} s ago`;
   if (curves.beam.y.length) shown.beam = `${curves.beam.y[curves.beam.y.length - 1].toPrecision(4)} ${curves.beam.unit}`;
   if (fit && now.status === "running") shown.volume = `${fit.n_views} views${fit.waiting ? `, ${fit.waiting} wait` : ""}, ${(fit.step / fit.views).toFixed(1)} steps a view, ${fit.n_gaussians} Gaussians`;
-  else if (fit && fit.steps && fit.step < fit.steps) shown.volume = `last round: step ${fit.step} of ${fit.steps}${fit.eta_s === null ? "" : `, ${duration(fit.eta_s)}`}`;
+  else if (work && work.steps && work.step < work.steps) shown.volume = `last round: ${work.step} of ${work.steps} ${work.unit || "steps"}${work.eta_s === null ? "" : `, ${duration(work.eta_s)} left for these`}`;
   shown["free disk"] = `${(now.free / 1e9).toFixed(1)} GB`;
   $("figures").replaceChildren(...Object.entries(shown).map(([name, value]) => { const box = element("div", ""); box.append(element("dt", name), element("dd", value)); return box; }));
   const over = now.status !== "running" && now.status !== "preparing";
   passes.update(!over, mayAct());
-  for (const button of document.querySelectorAll("#verbs button")) button.disabled = over || (button.dataset.verb === "resume" && word !== "paused") || (button.dataset.verb === "pause" && word === "paused");
+  for (const button of document.querySelectorAll("#verbs button")) button.disabled = over || (button.dataset.verb === "resume" && word !== "paused" && !pausing) || (button.dataset.verb === "pause" && word === "paused");
 }
 
 async function begin() {
@@ -338,10 +339,12 @@ for (const button of document.querySelectorAll("#verbs button")) button.addEvent
   if (verb !== "abort" || confirm("Abort the scan? The stage stops at once, and no further frame is taken.")) send(verb);
 });
 async function send(verb) {
-  $("said").textContent = `${verb}: sent`;
+  if (verb === "pause" || verb === "resume") pausing = verb === "pause";  // resume takes back a pause that has not begun
+  $("said").textContent = verb === "pause" ? "pause: sent. The scan pauses as soon as the frame, or the wait, that is under way has ended. Until then Resume takes the pause back." : `${verb}: sent`;
   const answer = await fetch(`api/verb/${verb}`, { method: "POST", headers: { "X-Act-Token": act } });
   const data = await answer.json().catch(() => ({}));
-  $("said").textContent = answer.ok ? "" : data.message || `${verb}: refused (${answer.status})`;
+  if (!answer.ok && verb === "pause") pausing = false;
+  if (!answer.ok || !pausing) $("said").textContent = answer.ok ? "" : data.message || `${verb}: refused (${answer.status})`;
 }
 
 // --- feed --------------------------------------------------------------------------------------------------------

@@ -221,13 +221,17 @@ async function showHistogram() {
   const found = await Promise.all(volumes.map((facts, which) => json(`api/histogram/${which}?time=${timeIn(facts)}`)));
   const x = [...new Set(found.flatMap((each) => each.values))].sort((a, b) => a - b);
   const lines = found.map((each, i) => { const at = new Map(each.values.map((value, k) => [value, each.voxels[k] || null])); return { name: volumes[i].name, values: x.map((value) => at.has(value) ? at.get(value) : undefined) }; });
-  draw("histogram", volumes[0].unit || "value", "voxels", x, lines, { x: { time: false }, y: { distr: 3 } });
+  $("counted").textContent = countedIn(volumes[0]);
+  draw("histogram", volumes[0].unit || "value", countedIn(volumes[0]), x, lines, { x: { time: false }, y: { distr: 3 } });
 }
+
+/** What the values of a volume, or of a scan's views, are of. */
+function countedIn({ angles }) { return angles.length ? "pixels" : "voxels"; }
 
 async function start() {
   volumes = await json("api/volumes");
   const [first, second] = volumes;
-  $("names").textContent = volumes.map((each) => `${each.name}: ${each.method ? `${each.method}, ` : ""}${each.seconds.length ? `${each.seconds.length} times ` : ""}${each.shape.join(" x ")} voxels${each.coarse_bin > 1 ? ` (slices across y and x binned by ${each.coarse_bin})` : ""}`).join("; ");
+  $("names").textContent = volumes.map((each) => `${each.name}: ${each.method ? `${each.method}, ` : ""}${each.seconds.length ? `${each.seconds.length} times ` : ""}${each.shape.join(" x ")} ${countedIn(each)}${each.coarse_bin > 1 ? ` (slices across y and x binned by ${each.coarse_bin})` : ""}`).join("; ");
   document.title = volumes.map((each) => each.name).join(", ");
   volumes.forEach((facts, which) => addRow(facts.name, facts, (axis, index) => `api/slice/${which}/${axis}/${index}`));
   const showWindow = (window) => { for (const row of rows.slice(0, volumes.length)) { row.window = window; row.pictures.forEach((picture) => picture.setWindow(window)); } plots.histogram?.redraw(); };

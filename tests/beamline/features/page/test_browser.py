@@ -91,6 +91,29 @@ def test_what_can_be_measured_next_is_shown_and_chosen(browser: Browser, tmp_pat
             assert browser.complaints() == []
 
 
+def test_a_pause_that_was_sent_is_taken_back(browser: Browser, tmp_path: Path) -> None:
+    """Also while the scan waits for its live volume, where it cannot pause yet."""
+    waits = {"event": "state", "time": 1.7e9, "state": "flats", "message": "Waiting until the fit is ready"}
+    (tmp_path / "events.jsonl").write_text(f"{json.dumps(waits)}\n", encoding="utf-8")
+    frames = frames_of(TwoCylinders())
+    with NXtomoWriter(tmp_path / "scan.h5", ScanInfo("s"), frames[0].counts.shape, clock=SystemClock()) as writer:
+        for frame in frames:
+            writer.append(frame, digest(frame.counts), [])
+        with asking(tmp_path), served(tmp_path, control=True) as page:
+            assert page.addresses.act is not None
+            browser.open(page.addresses.act)
+            resume = browser.driver.find_element("css selector", "[data-verb=resume]")
+            browser.until(lambda: browser.text("state") == "flats", "the scan waits")
+            assert browser.text("message") == waits["message"] and not resume.is_enabled()
+            browser.click("pause")
+            browser.until(lambda: browser.text("state") == "flats, pause sent", "the pause is sent")
+            assert "Resume takes the pause back" in browser.text("said")
+            browser.until(resume.is_enabled, "it can be taken back")
+            browser.click("resume")
+            browser.until(lambda: browser.text("state") == "flats" and not browser.text("said"), "it is taken back")
+            assert browser.complaints() == []
+
+
 def test_a_lost_server_is_told(browser: Browser, tmp_path: Path) -> None:
     write_flagged(tmp_path / "scan.h5", frames_of(TwoCylinders()), {})
     with page_of([*BEAMLINE, "watch", str(tmp_path / "scan.h5")], r"^watch +(\S+)") as (_, address):

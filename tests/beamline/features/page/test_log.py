@@ -18,7 +18,7 @@ console.log(JSON.stringify(lines.map((line) => line.text)));
 HEADER = """
 const made = {}, $ = (name) => made[name] ??= { append() {}, replaceChildren() {} }, element = $, document = { querySelectorAll: () => [] };
 const passes = { update() {} }, mayAct = () => false, again = () => "Again.", feed = { close() {} }, curves = { beam: { y: [] } }, COLOURS = {};
-let over = false, ended = "", planned = 9, state = "acquiring", rate = null, fit = null, ledger = { exposed: 5 };
+let over = false, ended = "", planned = 9, state = "acquiring", rate = null, fit = null, work = null, pausing = false, ledger = { exposed: 5 };
 FUNCTIONS
 const said = [], told = () => said.push([$("state").textContent, $("said").textContent]);
 for (const [status, over, next] of STATES) { header({ frames: 4, free: 1e9, age_s: 1, status, over, next }); told(); }

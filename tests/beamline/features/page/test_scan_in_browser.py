@@ -22,6 +22,7 @@ def test_the_slice_follows_the_axis(browser: Browser, tmp_path: Path) -> None:
     ):
         browser.open(address)
         browser.until(lambda: canvas_has_picture(browser, "fbp"), "the slice is drawn")
+        assert "900 x 1 x 2048 pixels" in browser.text("names")
         browser.until(lambda: browser.script("return !!document.getElementById('fbp').dataset.shown"), "it is whole")
         taken = []
         for axis in ("1022", "1025", "1018.5"):
