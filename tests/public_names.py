@@ -31,6 +31,7 @@ FOR_PACKAGES = {
     "beamline.cli.options": (
         "as_scan", "json_events", "json_option", "parsed", "say", "set_option", "volume_argument", "volume_path",
     ),
+    "beamline.cli.recipe": ("Repeatable", "typed_line"),
     "beamline.cli.terminal": ("Answer", "PageBeside", "Terminal", "answering"),
     "beamline.core.errors": (
         "AlarmError", "BeamlineError", "ConfigError", "DataError", "InstrumentError", "QualityError", "ScanStopped",
@@ -42,6 +43,7 @@ FOR_PACKAGES = {
     "beamline.core.events": ("BlockDone", "BlockStarted", "Sink", "StateEntered", "Warned", "json_of"),
     "beamline.core.machine": ("free_memory",),
     "beamline.core.run_result": ("RunResult",),
+    "beamline.core.sinks": ("Note",),
     "beamline.core.stop": ("ScanAborted", "StopRequest", "stop_signals"),
     "beamline.config.beam": ("NoBeamMonitor",),
     "beamline.config.load": ("load_as", "resolved_yaml"),
@@ -61,7 +63,8 @@ FOR_PACKAGES = {
     "beamline.scan.energies": ("scans_of",),
     "beamline.scenes.scene_file": ("open_scene",),
     "beamline.scan.control": ("State", "Verb", "ask"),
-    "beamline.scan.ledger": ("LedgerError",),
+    "beamline.scan.ledger": ("EXTRA", "LedgerError"),
+    "beamline.scan.live_process": ("Standby",),
     "beamline.scan.measurement": ("FrameSource", "Measurement"),
     "beamline.scan.preflight": ("ReadyScan", "ready_scan"),
     "beamline.scan.run": ("record_scan",),

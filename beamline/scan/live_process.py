@@ -292,7 +292,7 @@ class Standby:
         process, self._process = self._process, None
         if process is None or not process.running:
             return ChildProcess(command, stderr, on_line, tether=tether, on_end=on_end, behind=behind)
-        process.become(json.dumps([stderr.name, *command[3:]]), on_line, on_end)
+        process.become(json.dumps([stderr.name, *command[3:]], allow_nan=False), on_line, on_end)
         return process
 
     def close(self) -> None:

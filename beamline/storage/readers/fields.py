@@ -266,7 +266,11 @@ EXCHANGE: tuple[Entry, ...] = (
     Entry("exchange/data", "projections; the attribute `axes` tells the order of its dimensions, theta:y:x without it"),
     Entry("exchange/data_white", "flats, in the order that its `axes` tells, or that of data"),
     Entry("exchange/data_dark", "darks, in the order that its `axes` tells, or that of data"),
-    Entry("exchange/theta", "angle of each projection, by its `units`; degrees without them"),
+    Entry(
+        "exchange/theta",
+        "angle of each projection, by its `units`; degrees without them. Without it, the one start and the one step "
+        "of a rotation that attributes, or fields under `process`, state",
+    ),
     Entry("exchange/title", "name in reports"),
     Entry("measurement/sample/name", "name in reports"),
     Entry(

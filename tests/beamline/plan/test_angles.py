@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from beamline.plan import plan as angles
+from beamline.plan.limits import CLOSING
 from beamline.plan.plan import Mode, Retake, middle_of_exposure, retake_block, spread_retakes
 from beamline.plan.timeline import work_out
 from drivers.base.frame import FrameKind
@@ -158,7 +159,7 @@ def test_bytes_and_seconds_of_the_most_are_foreseen(share: float, most: int) -> 
         return
     assert f"up to {most} " in said[0]
     assert whole.retake_seconds > most * (plan.exposure + plan.settle)
-    needed = round(1.1 * bare.total_bytes * (1 + most / bare.n_frames))
+    needed = round(1.1 * bare.total_bytes * (1 + most / bare.n_frames)) + CLOSING
     for free, fits in ((needed + 9, True), (needed - 9, False)):
         tried = work_out(plan, stage.limits, stage.to_counts, camera.timing, free_bytes=free)
         assert (tried.violations == ()) is fits

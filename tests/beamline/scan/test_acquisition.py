@@ -80,7 +80,7 @@ def test_fly_any_lost_and_ignored_triggers_are_named(lost: set[int], ignored: se
     else:
         assert isinstance(run.error, LedgerError)
         assert run.error.missing == tuple(run.scan.missing)
-        assert f"{len(gone)} of 24 projections are missing" in str(run.error)
+        assert f"{len(gone)} of 24 projections {'is' if len(gone) == 1 else 'are'} missing" in str(run.error)
         assert_safe(instrument)
     assert run.views == [i for i in range(n) if i not in gone]
     assert run.scan.missing == [first + i for i in gone if i < n]
