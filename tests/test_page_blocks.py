@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import urllib.request
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -241,6 +242,9 @@ def test_the_first_reconstruction_of_readme_runs_as_it_is_printed(tmp_path: Path
         [sys.executable, "-m", "beamline.cli.main", *shlex.split(view, comments=True)[1:]],
         cwd=tmp_path, stdout=subprocess.PIPE, text=True, encoding="utf-8",
     ) as viewer:  # fmt: skip
-        assert viewer.stdout is not None and "http://" in viewer.stdout.readline()
+        assert viewer.stdout is not None
+        address = next(word for word in viewer.stdout.readline().split() if word.startswith("http://"))
+        with urllib.request.urlopen(address) as answer:  # it serves, so that Ctrl-C is its ordinary end
+            assert answer.status == 200
         viewer.send_signal(signal.SIGINT)
         assert viewer.wait(WITHIN) == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 from traceback import walk_tb
 from types import FrameType, ModuleType, TracebackType
@@ -126,8 +127,10 @@ def _origin(name: str) -> str | None:
     """The file that Python loads for a module, or has loaded; None where it has none."""
     if name in sys.modules:
         return getattr(sys.modules[name], "__file__", None)
-    specs = (finder.find_spec(name, None) for finder in sys.meta_path)
-    return next((spec.origin for spec in specs if spec is not None), None)
+    with suppress(ImportError):  # of a finder that forbids the library
+        specs = (finder.find_spec(name, None) for finder in sys.meta_path)
+        return next((spec.origin for spec in specs if spec is not None), None)
+    return None
 
 
 _AGAIN = "Install it again: `pip install --force-reinstall --no-deps splatline`"

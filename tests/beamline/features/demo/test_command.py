@@ -85,7 +85,7 @@ def test_from_trigger_to_judged_volume(here: Path) -> None:
 def test_a_live_volume_that_fails_leaves_the_scan_and_says_where_to_look(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sys.executable", str(here / "no-python"))
+    monkeypatch.setenv("BEAMLINE_PYTHON", str(here / "no-python"))
     with pytest.raises(DataError, match=r"recon\.log"):
         run_demo(_small("scan.angles.views=4", "scan.period_s=2"), here / "runs", [], StopRequest(), "beamline demo")
     (folder,) = (here / "runs").iterdir()
