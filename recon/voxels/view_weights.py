@@ -289,8 +289,8 @@ def unseen_wedges(geometry: Geometry) -> list[Wedge]:
 def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
     """In which gaps of a circle views are missing: wider than random views leave by chance, and than 8 usual ones.
 
-    One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): 1 in 1000 is allowed
-    for, or 1 in 20 where the other gaps are so alike that views are not at random.
+    One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): 1 in 1000 is
+    allowed for, or 1 in 20 where the other gaps are so alike that views are not at random.
     """
     others = np.sort(gaps)[:-1]
     chance = 1e-3 if others.std() > _ALIKE * others.mean() else 0.05
