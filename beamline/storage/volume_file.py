@@ -122,8 +122,8 @@ def _tiff_spacing(tif: tifffile.TiffFile) -> tuple[float, float, float] | None:
     except (TypeError, ValueError, ArithmeticError):
         return None
     z, y, x = mm
-    square = math.isclose(y, x, rel_tol=1e-3)  # others are the user's to state: no grid keeps them
-    return (z, y, x) if square and all(0 < each < math.inf for each in mm) else None
+    # Pixels that are no squares fit no grid: the user states an edge.
+    return (z, y, x) if all(0 < each < math.inf for each in mm) and math.isclose(y, x, rel_tol=1e-3) else None
 
 
 _PICTURES = (".png", ".bmp", ".jpg", ".jpeg")

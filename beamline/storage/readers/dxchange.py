@@ -245,8 +245,8 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
             return start + step * np.arange(n_views, dtype=np.float64)
         raise DataError(
             f"{file.filename} has no /exchange/theta, and neither /process/acquisition/rotation nor attributes of "
-            "/exchange state one start and one step of the rotation, of 180 degrees at most. Some readers then assume 0 to 180 degrees; we do not: "
-            "give them with --angles FILE (degrees, one a line)."
+            "/exchange state one start and one step of the rotation, of 180 degrees at most. Some readers then assume "
+            "0 to 180 degrees; we do not: give them with --angles FILE (degrees, one a line)."
         )
     angles = datasets.radians(theta, default="degrees")
     if all_there and (angles.size != n_views or n_views not in (1, *theta.shape)):
