@@ -294,8 +294,7 @@ def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
     """
     others = np.sort(gaps)[:-1]
     chance = 1e-3 if others.std() > _ALIKE * others.mean() else 0.05
-    by_chance = circle * (1 - (chance / gaps.size) ** (1 / (gaps.size - 1)))
-    return gaps > max(_GAP_LIMIT * _usual(gaps), by_chance)
+    return gaps > max(_GAP_LIMIT * _usual(gaps), circle * (1 - (chance / gaps.size) ** (1 / (gaps.size - 1))))
 
 
 def _usual(gaps: F64) -> float:

@@ -64,10 +64,12 @@ def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) 
             for kind, where, item in items
             if item is not None
         ]
-        facts = {**_attributes(file), "dimensions": dimensions(usual)}
+        facts = {**_attributes(file), "dimensions": dimensions(usual)} | (
+            {"angles_from": "start and step of the rotation, as the file has no exchange/theta"}
+            if own_angles and "exchange/theta" not in file
+            else {}
+        )
         source = ExchangeSource(path, file, stacks, format="data_exchange", facts=facts)
-        if own_angles and "exchange/theta" not in file:
-            source.facts = {**facts, "angles_from": "start and step of the rotation, as the file has no exchange/theta"}
         source.own_angles, source.grows, n_views = own_angles, not source.finished, len(stacks[-1].frames)
         if source.grows:
             source.rows = source.rows[:0]
@@ -226,8 +228,9 @@ def _measured(
     value, item = _positive(file, where, units), datasets.dataset(file, where)
     if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
-    number = datasets.text_of(item)
-    source.not_used += (NotUsed(where, number, "it has no attribute `units`, and in the SI's it cannot be", True),)
+    source.not_used += (
+        NotUsed(where, datasets.text_of(item), "it has no attribute `units`, and in the SI's it cannot be", True),
+    )
     return None
 
 
@@ -261,10 +264,11 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
 def _of_rotation(file: h5py.File, what: str) -> float | None:
     """The one number, in radians, that the acquisition or attributes of the exchange data state of the rotation, in
     degrees unless it has a unit; None: several or none."""
-    units = {**datasets.ANGLE_UNITS, "": math.radians(1)}
     attributes = [item.attrs.get(f"rotation_{what}") for item in (file["exchange"], file["exchange/data"])]
-    found = {math.radians(value) for value in attributes if isinstance(value, np.number)}
-    found |= {datasets.scalar(file, f"process/acquisition/rotation/{what}", units)} - {None}
+    by_group = datasets.scalar(
+        file, f"process/acquisition/rotation/{what}", {**datasets.ANGLE_UNITS, "": math.radians(1)}
+    )
+    found = {by_group, *(math.radians(value) for value in attributes if isinstance(value, np.number))} - {None}
     return found.pop() if len(found) == 1 else None
 
 

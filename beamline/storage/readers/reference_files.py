@@ -188,9 +188,9 @@ def places_of_flats(images: Images | None, shape: tuple[int, int], n: int) -> ND
     with hdf5.open_hdf5(Path(images)) as file, hdf5.readable(Path(images)):
         flats = sorted(_numbered(file, FrameKind.FLAT, shape).items())
         numbers = np.repeat([float(number) for number, _ in flats], [math.prod(item.shape[:-2]) for _, item in flats])
-    if len(flats) < 2:
-        return None
-    return (numbers - numbers[0]) / np.ptp(numbers) if numbers[-1] > n else np.where(numbers < n - 1, numbers / n, 1.0)
+    if len(flats) > 1 and numbers[-1] <= n:
+        return np.where(numbers < n - 1, numbers / n, 1.0)
+    return (numbers - numbers[0]) / np.ptp(numbers) if len(flats) > 1 else None
 
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
