@@ -121,8 +121,8 @@ def _tiff_spacing(tif: tifffile.TiffFile) -> tuple[float, float, float] | None:
         ]
     except (TypeError, ValueError, ArithmeticError):
         return None
-    z, y, x = mm
     # Pixels that are no squares fit no grid: the user states an edge.
+    z, y, x = mm
     return (z, y, x) if all(0 < each < math.inf for each in mm) and math.isclose(y, x, rel_tol=1e-3) else None
 
 

@@ -292,8 +292,7 @@ def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
     One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): 1 in 1000 is
     allowed for, or 1 in 20 where the other gaps are so alike that views are not at random.
     """
-    others = np.sort(gaps)[:-1]
-    chance = 1e-3 if others.std() > _ALIKE * others.mean() else 0.05
+    chance = 1e-3 if (others := np.sort(gaps)[:-1]).std() > _ALIKE * others.mean() else 0.05
     return gaps > max(_GAP_LIMIT * _usual(gaps), circle * (1 - (chance / gaps.size) ** (1 / (gaps.size - 1))))
 
 
