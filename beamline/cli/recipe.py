@@ -102,7 +102,7 @@ def config_option(command: Callable[..., Any]) -> Callable[..., Any]:
     )(command)
 
 
-_OF_ALL = ("angles", "angle-rows", "darks", "flats", "scanner-file")
+_ALLOWED_IN_RECIPES = ("angles", "angle-rows", "darks", "flats", "scanner-file")
 """Options on the data of one scan that a user may write into a recipe, where they hold for all scans."""
 
 
@@ -112,7 +112,7 @@ def _take(ctx: click.Context, param: click.Parameter, value: Path | None) -> Non
     options = {
         name_of(option): option
         for option in ctx.command.params
-        if isinstance(option, click.Option) and (not _is_of_one_call(option) or name_of(option) in _OF_ALL)
+        if isinstance(option, click.Option) and (not _is_of_one_call(option) or name_of(option) in _ALLOWED_IN_RECIPES)
     }
     former = {
         option.former.lstrip("-"): option

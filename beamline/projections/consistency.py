@@ -48,7 +48,7 @@ _STRETCH = 0.015  # a thorax hardened by 12 % has 0.011, measured scans up to 0.
 # Off the turn with both ends, or without, which are a step apart; told of 31 of 40 other scans, falsely of none of 232.
 _OF_A_STEP = 1 / 3
 _BESIDE_ROW = 8  # rows on both sides of the plane of the source that count as in it
-_OFTEN, _AGREE, _FAN = 1.2, 0.01, 2.5  # times the least disagreement, which is a share of the variance; degrees
+_OFTEN, _AGREE, _FAN = 1.3, 0.01, 2.5  # times the least disagreement, which is a share of the variance; degrees
 _SAME_AXIS = 1.0  # columns between the centres' axis and the one used, beyond which angles are not judged
 _FAINT = 0.3  # line integral: of matter fainter than that, as much as the air may have at an edge is a large part
 _FLOORED = 1e-3  # of the pixels, whose line integrals are too small; they are warned of
@@ -289,7 +289,7 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
     pitch, across = geometry.pixel_pitch, max(geometry.axis_col, data.shape[2] - 1 - geometry.axis_col)
     stated = pitch / geometry.sdd if geometry.is_cone else 0.0
     sinogram = data[some][:, rows].mean(axis=1, dtype=np.float64)
-    off, least, best = fans_shown(sinogram, geometry.angles[some], geometry.axis_col, stated)
+    off, least, usual, best = fans_shown(sinogram, geometry.angles[some], geometry.axis_col, stated)
     told, shown = (2 * math.degrees(math.atan(slope * across)) for slope in (stated, best))
     away = f" ({pitch / best:.3g} mm from source to detector)" if geometry.is_cone and best > 0 else ""
     check = (
@@ -301,7 +301,7 @@ def _fan(data: F32, some: NDArray[np.intp], geometry: Geometry) -> ConsistencyCo
         f"The views disagree with the stated geometry: rays that are measured from both sides agree for a fan of "
         f"{shown:.3g} degrees across the detector{away} instead of {told:.3g}. {check}"
     )
-    sure = off > _OFTEN * least and least < _AGREE
+    sure = off > _OFTEN * least and least < min(_AGREE, usual / 2)  # a round sample agrees for every fan
     return ConsistencyCondition(
         "rays from both sides", abs(shown - told) if sure else np.nan, _FAN, "degrees of fan", sentence
     )

@@ -121,8 +121,9 @@ def _tiff_spacing(tif: tifffile.TiffFile) -> tuple[float, float, float] | None:
         ]
     except (TypeError, ValueError, ArithmeticError):
         return None
+    # Pixels that are no squares fit no grid: the user states an edge.
     z, y, x = mm
-    return (z, y, x) if all(0 < each < math.inf for each in mm) else None
+    return (z, y, x) if all(0 < each < math.inf for each in mm) and math.isclose(y, x, rel_tol=1e-3) else None
 
 
 _PICTURES = (".png", ".bmp", ".jpg", ".jpeg")
@@ -139,8 +140,10 @@ def _from_folder(path: Path) -> tuple[NDArray[np.generic], tuple[float, float, f
     by_kind = ([name for name in names if name.lower().endswith(kind)] for kind in ((".tif", ".tiff"), _PICTURES))
     series: dict[str, list[str]] = {}
     for name in next(filter(None, by_kind), []):
-        series.setdefault(re.sub(r"\d+", "#", name), []).append(name)
+        series.setdefault(re.sub(r"-?\d+", "#", name), []).append(name)
     files = max(series.values(), key=len, default=[])
+    if len({re.sub(r"\d+", "#", name) for name in files}) > 1:  # z-1 beside z1: a sign, no hyphen
+        files.sort(key=lambda name: [int(number) for number in re.findall(r"-?\d+", name)])
     files = files if len(files) > 1 else [name for some in series.values() for name in some]
     if not files:
         inside = [path / name for name in (RECON, "volume.h5") if (path / name).is_file()]

@@ -12,7 +12,7 @@ _WIDEST, _STEP = 0.5, 0.01  # radians from the beam's axis to the edge of the de
 _COLS = 256  # of more, columns are binned
 
 
-def fans_shown(sinogram: F64, angles: F64, axis_col: float, slope: float) -> tuple[float, float, float]:
+def fans_shown(sinogram: F64, angles: F64, axis_col: float, slope: float) -> tuple[float, float, float, float]:
     """How ill measurements of a ray from both sides agree, with the fan that is stated, and with the best one.
 
     The ray at γ in the view β is the ray at -γ in the view β + π - 2γ, with tan γ = slope x columns from the axis.
@@ -22,8 +22,8 @@ def fans_shown(sinogram: F64, angles: F64, axis_col: float, slope: float) -> tup
         slope: pitch of the detector over its distance from the source; 0: parallel rays.
 
     Returns:
-        Mean square of the differences over twice the variance, as stated and at best: 0 where they agree, 1 where
-        they have nothing in common. And the best slope.
+        Mean square of the differences over twice the variance, as stated, at best, and the median over slopes: 0 where
+        they agree, 1 where they have nothing in common. And the best slope.
     """
     order = np.argsort(np.mod(angles, 2 * math.pi), kind="stable")
     factor = math.ceil(sinogram.shape[1] / _COLS)
@@ -43,4 +43,4 @@ def fans_shown(sinogram: F64, angles: F64, axis_col: float, slope: float) -> tup
 
     slopes = np.tan(np.arange(0, _WIDEST, _STEP)) / u[-1]
     found = [disagreement(each) for each in slopes]
-    return disagreement(slope), min(found), float(slopes[int(np.argmin(found))])
+    return disagreement(slope), min(found), float(np.median(found)), float(slopes[int(np.argmin(found))])

@@ -14,6 +14,7 @@ from recon.base.geometry import Geometry
 _GAP_LIMIT = 8.0  # an angular gap this many times the usual one may be missing data, not coarse sampling
 _FAR = np.pi / 6  # a gap beyond this is missing data, however many are like it, unless most views are as far apart
 _THINNED = 2.5  # usual steps between the views of a part of a scan, at most
+_ALIKE = 0.4  # standard deviation of gaps over their mean: 0.24 of golden angles, about 0.7 of random ones
 _SAME_ANGLE = 1e-3  # of the mean step: views closer than this share one weight
 
 
@@ -288,10 +289,11 @@ def unseen_wedges(geometry: Geometry) -> list[Wedge]:
 def _missing(gaps: F64, circle: float) -> NDArray[np.bool_]:
     """In which gaps of a circle views are missing: wider than random views leave by chance, and than 8 usual ones.
 
-    One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1), here 1 in 20.
+    One of n random gaps exceeds a share x of the circle with a chance of at most n (1 - x)^(n - 1): 1 in 1000 is
+    allowed for, or 1 in 20 where the other gaps are so alike that views are not at random.
     """
-    by_chance = circle * (1 - (0.05 / gaps.size) ** (1 / (gaps.size - 1)))
-    return gaps > max(_GAP_LIMIT * _usual(gaps), by_chance)
+    chance = 1e-3 if (others := np.sort(gaps)[:-1]).std() > _ALIKE * others.mean() else 0.05
+    return gaps > max(_GAP_LIMIT * _usual(gaps), circle * (1 - (chance / gaps.size) ** (1 / (gaps.size - 1))))
 
 
 def _usual(gaps: F64) -> float:

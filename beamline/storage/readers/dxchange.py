@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -65,7 +64,11 @@ def open_exchange(path: Path, *, follow: bool = False, own_angles: bool = True) 
             for kind, where, item in items
             if item is not None
         ]
-        facts = {**_attributes(file), "dimensions": dimensions(usual)}
+        facts = {**_attributes(file), "dimensions": dimensions(usual)} | (
+            {"angles_from": "start and step of the rotation, as the file has no exchange/theta"}
+            if own_angles and "exchange/theta" not in file
+            else {}
+        )
         source = ExchangeSource(path, file, stacks, format="data_exchange", facts=facts)
         source.own_angles, source.grows, n_views = own_angles, not source.finished, len(stacks[-1].frames)
         if source.grows:
@@ -225,8 +228,9 @@ def _measured(
     value, item = _positive(file, where, units), datasets.dataset(file, where)
     if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
-    number = datasets.text_of(item)
-    source.not_used += (NotUsed(where, number, "it has no attribute `units`, and in the SI's it cannot be", True),)
+    source.not_used += (
+        NotUsed(where, datasets.text_of(item), "it has no attribute `units`, and in the SI's it cannot be", True),
+    )
     return None
 
 
@@ -240,12 +244,12 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
     if theta is None:
         datasets.refuse_broken(file, "exchange/theta")
         start, step = (_of_rotation(file, what) for what in ("start", "step"))
-        if start is not None and step:
+        if start is not None and step and abs(step) <= math.pi:
             return start + step * np.arange(n_views, dtype=np.float64)
         raise DataError(
-            f"{file.filename} has no /exchange/theta, and nothing under /process or among its attributes states one "
-            "start and one step of a rotation. Some readers then assume 0 to 180 degrees; we do not: "
-            "give them with --angles FILE (degrees, one a line)."
+            f"{file.filename} has no /exchange/theta, and neither /process/acquisition/rotation nor attributes of "
+            "/exchange state one start and one step of the rotation, of 180 degrees at most. Some readers then assume "
+            "0 to 180 degrees; we do not: give them with --angles FILE (degrees, one a line)."
         )
     angles = datasets.radians(theta, default="degrees")
     if all_there and (angles.size != n_views or n_views not in (1, *theta.shape)):
@@ -258,24 +262,14 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
 
 
 def _of_rotation(file: h5py.File, what: str) -> float | None:
-    """The one number, in radians, that attributes or the acquisition under /process call so of a rotation, in degrees
-    unless they state a unit; None: several or none."""
-    items: list[Any] = [file, file["exchange"], file["exchange/data"]]
-    if isinstance(process := datasets.resolve(file, "process"), h5py.Group):
-        process.visititems(lambda _, item: items.append(item))
-    stated = [(f"{item.name}/{key}", value, item) for item in items for key, value in item.attrs.items()]
-    stated += [(item.name, item[()], item) for item in items if isinstance(item, h5py.Dataset) and item.size == 1]
-    ours = [each for each in stated if what in each[0].lower() and _ROTATION.search(each[0].lower())]
-    units = [datasets.attribute(item, "units") or "degrees" for *_, item in ours]
-    found = {
-        float(np.ravel(value)[0]) * (datasets.factor_of(unit, datasets.ANGLE_UNITS) or np.nan)
-        for (_, value, _), unit in zip(ours, units, strict=True)
-        if np.asarray(value).dtype.kind in "iuf" and np.size(value) == 1
-    }
+    """The one number, in radians, that the acquisition or attributes of the exchange data state of the rotation, in
+    degrees unless it has a unit; None: several or none."""
+    attributes = [item.attrs.get(f"rotation_{what}") for item in (file["exchange"], file["exchange/data"])]
+    by_group = datasets.scalar(
+        file, f"process/acquisition/rotation/{what}", {**datasets.ANGLE_UNITS, "": math.radians(1)}
+    )
+    found = {by_group, *(math.radians(value) for value in attributes if isinstance(value, np.number))} - {None}
     return found.pop() if len(found) == 1 else None
-
-
-_ROTATION = re.compile("rot|angle|angular|theta|omega")
 
 
 def _attributes(file: h5py.File) -> dict[str, str | float | int]:

@@ -268,8 +268,8 @@ EXCHANGE: tuple[Entry, ...] = (
     Entry("exchange/data_dark", "darks, in the order that its `axes` tells, or that of data"),
     Entry(
         "exchange/theta",
-        "angle of each projection, by its `units`; degrees without them. Without it, the one start and the one step "
-        "of a rotation that attributes, or fields under `process`, state",
+        "angle of each projection, by its `units`; degrees without them. Without it, `start` and `step` in "
+        "`process/acquisition/rotation`, or the attributes `rotation_start` and `rotation_step` of exchange or data",
     ),
     Entry("exchange/title", "name in reports"),
     Entry("measurement/sample/name", "name in reports"),

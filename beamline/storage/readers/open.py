@@ -249,7 +249,7 @@ def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | 
         darks=None if darks is None else load_images(darks, FrameKind.DARK, base.shape),
         flats=None if flats is None else load_images(flats, FrameKind.FLAT, base.shape),
         quantity="counts" if quantity == "transmission" else quantity,
-        places=places_of_flats(flats, base.shape),
+        places=places_of_flats(flats, base.shape, len(base.table)),
     )
 
 

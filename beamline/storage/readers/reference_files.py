@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -179,14 +180,17 @@ def _numbered(file: h5py.File, kind: FrameKind, shape: tuple[int, int] | None) -
     return {int(number): item for _, number, item in ours} if len({of for of, *_ in ours}) == 1 else {}
 
 
-def places_of_flats(images: Images | None, shape: tuple[int, int]) -> NDArray[np.float64] | None:
-    """Where in a scan, from its first frame (0) to its last (1), each of the flats in a file was taken; None: it does
-    not say."""
+def places_of_flats(images: Images | None, shape: tuple[int, int], n: int) -> NDArray[np.float64] | None:
+    """Where in a scan of n frames, from its first (0) to its last (1), each of the flats in a file was taken; None: it
+    does not say. Numbers beyond n count other frames, too: then the first flat is at the first frame."""
     if not isinstance(images, Path | str) or not Path(images).is_file() or not hdf5.is_hdf5(Path(images)):
         return None
     with hdf5.open_hdf5(Path(images)) as file, hdf5.readable(Path(images)):
-        numbers = np.array(sorted(_numbered(file, FrameKind.FLAT, shape)), np.float64)
-    return (numbers - numbers[0]) / np.ptp(numbers) if numbers.size > 1 else None
+        flats = sorted(_numbered(file, FrameKind.FLAT, shape).items())
+        numbers = np.repeat([float(number) for number, _ in flats], [math.prod(item.shape[:-2]) for _, item in flats])
+    if len(flats) > 1 and numbers[-1] <= n:
+        return np.where(numbers < n - 1, numbers / n, 1.0)
+    return (numbers - numbers[0]) / np.ptp(numbers) if len(flats) > 1 else None
 
 
 def _images(file: h5py.File) -> Iterator[h5py.Dataset]:

@@ -93,8 +93,9 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
     All gaps count in which `angular_weights` take views for missing, if these are a twentieth of half a turn.
 
     Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
-    distributed length, whose mean is that of all gaps (Rényi 1953); one scan in a thousand (of ten views: in a hundred)
-    exceeds what is allowed for. Views in even steps have gaps alike, and half a degree more is named.
+    distributed length, whose mean is that of all gaps (Rényi 1953). Two scans of 45 or more such views in a thousand,
+    and one of ten views in a hundred, exceed what is allowed for. Views in even steps have gaps alike, and half a
+    degree more is named.
     """
     places = np.sort(np.mod(np.degrees(angles), 180.0))
     gaps = np.diff(places, append=places[0] + 180.0)

@@ -208,8 +208,8 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
             f"values: {n_materials} --materials cannot be told among them; leave it out, and each label is a material"
         )
     if labels.size:
-        stated = ", ".join(f"{each:g}" for each in labels)
-        answer.warn(Note(f"{path} is taken as labels, not as grey values: {stated} are materials 1 to {labels.size}."))
+        materials = (f"{each:g} is material {number}" for number, each in enumerate(labels, 1))
+        answer.warn(Note(f"{path} is taken as labels, not as grey values: the value {', '.join(materials)}."))
     if max(particles, values["through"]) > n_materials:
         raise ConfigError(
             f"Material {max(particles, values['through'])} of {n_materials}: they are numbered from 1. Nothing was "

@@ -308,7 +308,7 @@ def test_labels_edges_and_options_are_said_back(here: Path) -> None:
     result = beamline(*words)
     assert result.exit_code == 0, result.output
     assert "states voxels of 30 x 10 x 10 µm" in result.stderr
-    assert "is taken as labels, not as grey values: 0, 1 are materials 1 to 2" in result.stderr
+    assert "is taken as labels, not as grey values: the value 0 is material 1, 1 is material 2." in result.stderr
     settings = json.loads((here / "o/structure.json").read_text(encoding="utf-8"))
     assert " ".join(words) in json.dumps(settings)
 

@@ -89,3 +89,14 @@ def test_a_cone_that_is_not_stated_is_told_and_parallel_rays_are_not() -> None:
         told_of = [sentence for sentence in sentences if "disagree with the stated geometry" in sentence]
         assert len(told_of) == expected, sentences
         assert not told_of or "instead of 0. If the beam is a cone, give --cone SOD:SDD" in told_of[0]
+
+
+@pytest.mark.parametrize("axis_col", [47.5, 47.2, 44.0])
+def test_a_round_noisy_sample_shows_no_fan(axis_col: float) -> None:
+    """Its views agree for every fan, and only with parallel rays is nothing interpolated, which averages noise."""
+    angles, u = np.arange(90) * 2 * np.pi / 90, np.arange(96) - axis_col
+    noise = np.random.default_rng(0).normal(0, 0.06, (90, 12, 96))
+    source = ArraySource((np.sqrt(np.clip(1 - (u / 32) ** 2, 0, None)) + noise).astype(np.float32), [0] * 90, angles)
+    source.quantity = "line_integrals"
+    _, sentences = prepare(source, Selection(axis_col=axis_col))
+    assert not any("disagree with the stated geometry" in sentence for sentence in sentences)

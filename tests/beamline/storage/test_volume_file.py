@@ -176,3 +176,13 @@ def test_coloured_pictures_are_no_volume(tmp_path: Path) -> None:
     Image.fromarray(grey).save(tmp_path / "s_1.png")
     with pytest.raises(DataError, match="it has colours"):
         read_volume(tmp_path)
+
+
+def test_slices_with_signed_numbers_and_voxels_that_are_no_squares_are_read(tmp_path: Path) -> None:
+    for z in range(-3, 3):
+        tifffile.imwrite(tmp_path / f"z{z}.tif", np.full((4, 5), 10 + z, np.uint8))
+    assert read_volume(tmp_path)[0][:, 0, 0].tolist() == [7, 8, 9, 10, 11, 12]
+    path, volume = tmp_path / "v.tif", np.ones((3, 4, 5), np.float32)
+    facts = {"spacing": 2.0, "unit": "um", "axes": "ZYX"}
+    tifffile.imwrite(path, volume, imagej=True, resolution=(2, 1.5), metadata=facts)
+    assert read_volume(path)[1] is None

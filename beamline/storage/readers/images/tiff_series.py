@@ -355,7 +355,7 @@ def _of_stacks(path: Path, images: NamedImages) -> ScanSource:
 
 def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
     """The scan of the folder above, where its views are those of this one, and others are darks or flats."""
-    with suppress(Exception):  # what lies there is only looked at, and may be anything
+    with suppress(DataError, OSError):  # what lies there is only looked at, and may be no scan
         above = TiffSeriesSource(source.path.absolute().parent)
         views = [Path(above.names[i]).parts[0] for i in above.table.views]
         beside = sorted({Path(name).parts[0] for name in above.names} - {*views})

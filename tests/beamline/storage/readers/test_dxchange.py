@@ -204,7 +204,7 @@ def test_axes_that_are_unknown_are_named(tmp_path: Path) -> None:
     assert hit.severity == "warning" and "exchange/data@axes, a:b:c" in hit.message
 
 
-@pytest.mark.parametrize("where", ["attributes", "process", "radians", "two", "elsewhere"])
+@pytest.mark.parametrize("where", ["attributes", "process", "radians", "two", "elsewhere", "search", "count", "wide"])
 def test_start_and_step_of_the_rotation_stand_for_theta(tmp_path: Path, parts: Parts, where: str) -> None:
     del parts["theta"]
     path = store(tmp_path / "s.h5", parts)
@@ -212,16 +212,22 @@ def test_start_and_step_of_the_rotation_stand_for_theta(tmp_path: Path, parts: P
         if where == "attributes":
             file["exchange"].attrs.update(rotation_start=10.0, rotation_step=36.0, exposure_start=3.0)
         else:
-            group = file.create_group("exposure" if where == "elsewhere" else "process/acquisition/rotation")
+            others = {"elsewhere": "exposure", "search": "process/rotation_axis_search"}
+            group = file.create_group(others.get(where, "process/acquisition/rotation"))
+            group.attrs["restart_theta"] = 3.0
             group["start"], group["step"] = np.radians([10.0, 36.0]) if where == "radians" else (10.0, 36.0)
             for name in ("start", "step"):
                 group[name].attrs["units"] = "rad" if where == "radians" else "deg"
         if where == "two":
-            file["process"].attrs["rotation_start_stated"] = 0.0
-            file["process/acquisition/rotation_start"] = 0.0
-    if where in ("two", "elsewhere"):
+            file["exchange/data"].attrs["rotation_start"] = 0.0
+        elif where == "count":
+            group.move("step", "num_steps")
+        elif where == "wide":
+            group["step"][()] = 1500.0
+    if where not in ("attributes", "process", "radians"):
         with pytest.raises(DataError, match=r"no /exchange/theta.*--angles FILE"):
             open_scan(path)
     else:
         with open_scan(path) as source:
             np.testing.assert_allclose(np.degrees(source.table.angles[-5:]), 10 + 36 * np.arange(5))
+            assert "start and step of the rotation" in source.attributes["angles_from"]

@@ -127,3 +127,13 @@ def test_flats_of_several_places_stand_where_they_were_taken(tmp_path: Path, fir
         assert source.read(source.table.flats)[:, 0, 0].tolist() == [900, 800, 700]
         assert source.read([-1, 0, 4])[:, 1, 1].tolist() == [700, 0, 0]
         np.testing.assert_array_equal(source.read(source.table.views, slice(1, 3)), views[:, 1:3])
+
+
+@pytest.mark.parametrize(("last", "expected"), [(45, 3 + 45), (90, 3 + 90), (89, 3 + 90)])
+def test_flats_of_three_frames_stand_before_the_frame_of_their_number(tmp_path: Path, last: int, expected: int) -> None:
+    with h5py.File(tmp_path / "flats.h5", "w") as file:
+        for place in (0, last):
+            file[f"entry0000/flats/{place}"] = np.full((3, *SHAPE), 900 + place, np.float32)
+    np.save(tmp_path / "v.npy", np.zeros((90, *SHAPE), np.float32))
+    with open_scan(SourceOptions(tmp_path / "v.npy", darks="0", flats=tmp_path / "flats.h5")) as source:
+        assert source.table.flats.tolist() == [1, 2, 3, *range(1 + expected, 4 + expected)]

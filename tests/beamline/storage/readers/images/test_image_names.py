@@ -180,6 +180,20 @@ def test_references_in_folders_beside_the_views_are_taken_for_counts(tmp_path: P
     assert "Counts without flats: give --flats FILE" in _of_references(SourceOptions(views, "counts", angles))
 
 
+def test_a_defect_while_looking_beside_the_views_is_no_scan_without_references(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("Tomo", "Flat_Before"):
+        _written(tmp_path / name, [f"IMAT_{name}_{i}.tif" for i in range(4)])
+
+    def fails(names: object) -> str:
+        raise MemoryError
+
+    monkeypatch.setattr("beamline.storage.readers.images.tiff_series.sorted", fails, raising=False)
+    with pytest.raises(MemoryError):
+        open_scan(SourceOptions(tmp_path / "Tomo", "counts", np.arange(4.0))).close()
+
+
 def _of_references(scan: SourceOptions) -> str:
     return " ".join(each.message for each in validate(scan) if each.rule == "references")
 
