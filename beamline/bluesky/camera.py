@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from bluesky.run_engine import RunEngine
 from ophyd_async.core import (
+    AsyncStatus,
     DetectorAcquireLogic,
     DetectorDataLogic,
     DetectorTriggerLogic,

@@ -84,7 +84,7 @@ def installation_problem(error: BaseException) -> str:
 def as_one_line(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """`sys.excepthook` that says in one line which library cannot be loaded."""
     if problem := installation_problem(error):
-        print(f"beamline: {problem}", file=sys.stderr)
+        sys.stderr.write(f"beamline: {problem}\n")
         sys.exit(2)
     sys.__excepthook__(kind, error, trace)
 

@@ -108,13 +108,7 @@ def _ride(
         if page:  # of all its scans, at one address
             runs.mkdir(parents=True, exist_ok=True)
             tell = held.enter_context(PageBeside(terminal.say)).serve("runs", str(runs), "--page")
-            sinks.append(
-                lambda event: (
-                    tell(f"{event.folder}\n".encode(errors="surrogateescape"))
-                    if isinstance(event, RunStarted)
-                    else None
-                )
-            )
+            sinks.append(lambda event: tell(f"{event.folder}\n".encode()) if isinstance(event, RunStarted) else None)
         live = None
         if config.recon.live and not no_live:
             live = Standby()
