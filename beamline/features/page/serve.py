@@ -175,7 +175,7 @@ class RunBrowser:
         return guarded("runs.html", routes, access)
 
     def table(self, request: Request) -> Response:
-        """Head and rows, newest first, each with its page's number and the next step for the run; the number of the newest own one."""
+        """Head and rows, newest first, each with its page's number and the next step; that of the newest own run."""
         with self._lock:
             rows = [
                 {"number": self._numbers.setdefault(run, len(self._numbers)), "cells": cells(it), "next": it.next_step}

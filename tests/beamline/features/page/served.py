@@ -48,7 +48,7 @@ def viewed(*paths: Path, held: int = HELD) -> Iterator[Served]:
 def listed(folder: Path, own: Sequence[Path] | None = None) -> Iterator[Served]:
     """The page of a folder of runs; own: beside the program that records these."""
     with ExitStack() as opened:
-        runs = opened.enter_context(closing(RunBrowser(folder, own or ())))
+        runs = opened.enter_context(closing(RunBrowser(folder, () if own is None else own)))
         server = start(runs.app, open_port("127.0.0.1", 0), control=own is not None)
         yield opened.enter_context(_running(server))
 
