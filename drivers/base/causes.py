@@ -105,5 +105,4 @@ _FOREIGN = (  # searched in the URL, a line end, and what was heard
 
 def of_bytes(url: str, heard: str) -> tuple[str, str]:
     """Who speaks on a line in the place of its device, by what was heard (a character a byte), and what to do."""
-    flags = re.IGNORECASE | re.DOTALL
-    return next((row[1:] for row in _FOREIGN if re.search(row[0], f"{url}\n{heard}", flags)), ("", ""))
+    return next((row[1:] for row in _FOREIGN if re.search(f"(?is){row[0]}", f"{url}\n{heard}")), ("", ""))

@@ -149,8 +149,11 @@ def _serve(folder: Path, port: int, bind: str, tethered: bool, browse: bool) -> 
     with closing(RunBrowser(folder, own)) as runs:
         server = start(runs.app, open_port(bind, port), control=tethered)
         if tethered:
-            pipe = sys.stdin.fileno()
-            at_end_of(pipe, lambda: _end(server), lambda told: own.extend(map(Path, told.decode().splitlines())))
+            at_end_of(
+                sys.stdin.fileno(),
+                lambda: _end(server),
+                lambda told: own.extend(map(Path, told.decode().splitlines())),
+            )
         serve_shown(server, browse)
 
 

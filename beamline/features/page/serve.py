@@ -204,8 +204,7 @@ class RunBrowser:
             for n in unused[: len(self._opened) + 1 - OPEN_RUNS]:
                 self._opened.pop(n).reader.close()
             reader = Reader(watched(runs[number]))
-            access = self._access if is_own else replace(self._access, act=None)
-            routes = page_routes(reader, access, lambda line: None)
+            routes = page_routes(reader, self._access if is_own else replace(self._access, act=None), lambda line: None)
             self._opened[opened] = _Opened(reader, begins_with("index.html", routes))
         return self._opened[opened]
 
