@@ -4,12 +4,10 @@ import sys
 
 from beamline.core.installed import as_one_line, package_problem
 
-_is_command = sys.argv[0].endswith(("beamline", "beamline.exe"))
-if _problem := package_problem(__path__[0].removesuffix("beamline").rstrip("/\\")):
-    # A command says it in one line, without a traceback.
-    raise (SystemExit if _is_command else ImportError)(_problem)
-if _is_command:
+if sys.argv[0].endswith(("beamline", "beamline.exe")):
     sys.excepthook = as_one_line  # of what a command loads before it can say anything
+if _problem := package_problem(__path__[0].removesuffix("beamline").rstrip("/\\")):
+    raise ImportError(_problem, name="splatline")
 
 
 def __getattr__(name: str) -> str:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from bluesky.run_engine import RunEngine
 from ophyd_async.core import (
+    AsyncStatus,
     DetectorAcquireLogic,
     DetectorDataLogic,
     DetectorTriggerLogic,
@@ -269,6 +270,12 @@ class CameraDetector(StandardDetector):
 
             self._frames.ended_by = ended_by
         return super().stage()
+
+    @AsyncStatus.wrap
+    async def unstage(self) -> None:
+        """End the frames and the file, and hear the RunEngine no more."""
+        await super().unstage()
+        self._frames.ended_by()
 
     def trigger(self) -> Any:
         """Take one frame."""

@@ -226,7 +226,7 @@ def fit(at: FitReached) -> str:
     parts += [f"{at.n_gaussians} Gaussians"] if at.n_gaussians else []
     errors = {"residual": at.residual, "held out": at.held_out}
     parts += [f"{name} {error:.4f}" for name, error in errors.items() if error is not None and math.isfinite(error)]
-    left = "left for these" if at.unit else "left"  # other parts of the work may follow
+    left = "left for this step" if at.unit else "left"  # other parts of the work may follow
     parts += [] if at.eta_s is None else [f"{timedelta(seconds=round(at.eta_s))} {left}"]
     return ", ".join(parts)
 
@@ -309,16 +309,18 @@ class PageBeside:
         if isinstance(event, RunStarted):
             self.serve("watch", str(event.folder), "--control")
 
-    def serve(self, *page: str) -> None:
-        """Start the server of a page by its command."""
-        command = [sys.executable, "-m", "beamline.cli.main", *page, "--until-stdin-ends"]
+    def serve(self, *command: str) -> Callable[[bytes], object]:
+        """Start the server of a page by its command; returns what writes to it."""
+        words = [sys.executable, "-m", "beamline.cli.main", *command, "--until-stdin-ends"]
         try:
             nowhere = self._held.enter_context(Path(os.devnull).open("w"))  # noqa: SIM115 - the context closes it
-            child = ChildProcess(command, nowhere, self._pass_on, tether=True, behind=True)
+            child = ChildProcess(words, nowhere, self._pass_on, tether=True, behind=True)
             self._held.callback(child.wait, seconds=ENDS_WITHIN)
             self._held.callback(child.let_go)  # first: open pages are told that they end
+            return child.tell
         except OSError as error:
             self._say(f"There is no page ({error}). The scan is not affected.")
+            return lambda text: None
 
     def _pass_on(self, line: str) -> None:
         what, _, address = line.strip().partition(" ")

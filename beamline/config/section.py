@@ -35,7 +35,7 @@ class Section(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _as_meant(cls, data: Any) -> Any:
+    def _refuse_yaml_traps(cls, data: Any) -> Any:
         """Refuse what YAML reads otherwise than it was meant."""
         for name, field in cls.model_fields.items() if isinstance(data, dict) else ():
             truths, value = (field.annotation, *get_args(field.annotation)), data.get(name)

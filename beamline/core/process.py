@@ -245,17 +245,17 @@ def run_to_end(
     return ending, process.code, last_line(log)
 
 
-def at_end_of(pipe: int, act: Callable[[], object]) -> None:
+def at_end_of(pipe: int, act: Callable[[], object], told: Callable[[bytes], object] = lambda text: None) -> None:
     """Call `act` in a separate thread when the file descriptor `pipe` reaches its end: the process at its other end is
-    dead.
+    dead. Until then `told` gets what that one writes.
 
     Raw reads: a thread that waits in a buffered one would hold a lock that the interpreter wants at its own end.
     """
 
     def wait() -> None:
         with suppress(OSError):
-            while os.read(pipe, 1024):
-                pass
+            while text := os.read(pipe, 65536):
+                told(text)
         act()
 
     threading.Thread(target=wait, name="parent", daemon=True).start()

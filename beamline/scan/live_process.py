@@ -280,9 +280,10 @@ class Standby:
     def prepare(self) -> None:
         """Have one that waits, unless one does; a failure shows where it would be used."""
         if self._process is None or not self._process.running:
-            words = [sys.executable, "-m", "beamline.cli.standby"]
             with suppress(OSError), Path(os.devnull).open("w") as nowhere:
-                self._process = ChildProcess(words, nowhere, lambda line: None, tether=True, behind=True)
+                self._process = ChildProcess(
+                    [sys.executable, "-m", "beamline.cli.standby"], nowhere, lambda line: None, tether=True, behind=True
+                )
 
     def start(
         self, command: Sequence[str], stderr: TextIO, on_line: Callable[[str], None], *, on_end: Callable[[], None],

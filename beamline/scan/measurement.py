@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -225,8 +225,9 @@ class Measurement:
     def _wait_for(self, follower: LiveReconstruction | None) -> None:
         """Wait until the live reconstruction is ready for views."""
         if follower is not None:
-            say = partial(self.states.enter, self.states.state)
-            follower.wait_ready(READY_WITHIN, lambda: self.stop.stopping, say)
+            follower.wait_ready(
+                READY_WITHIN, lambda: self.stop.stopping, lambda text: self.states.enter(self.states.state, text)
+            )
 
     def _recorder(self, writer: NXtomoWriter) -> Recorder:
         monitor = self.config.monitor

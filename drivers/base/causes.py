@@ -1,4 +1,4 @@
-"""Causes: why a module is another one, a library does not load, a port does not open, and who else speaks on a line.
+"""Causes: why a library does not load, a port does not open, and who else speaks on a line.
 
 The one place where drivers turn what others say (loaders, operating systems, servers) into a sentence and the way on.
 """
@@ -10,8 +10,6 @@ import re
 import sysconfig
 from contextlib import suppress
 from pathlib import Path
-
-from drivers.base.errors import DeviceError
 
 _LOADERS = (
     (r"ELFCLASS(\d+)", "it is for {0} bits, and this Python is not", "Give the library for this Python"),
@@ -39,20 +37,9 @@ _LOADERS = (
 )  # what the loaders of Linux (which calls one for another processor not found), macOS and Windows say
 
 
-def of_module(name: str, package: str, problem: ImportError) -> DeviceError:
-    """The error where a module is not that of the package that drivers need."""
-    return DeviceError(
-        f"module {name}",
-        f"it is not that of {package} ({problem})",
-        advice=f"Where PyPI's package `{name}` has taken its place: `pip uninstall {name}`, then `pip install "
-        f"--force-reinstall {package}`. Where a {name}.py or a folder of yours has, rename that",
-        state="Nothing was sent",
-    )
-
-
 def of_library(name: str, problem: OSError) -> tuple[str, str]:
     """Why a library is not loaded, and what to do; both empty where it is not there."""
-    for said, what, advice in _LOADERS if Path(name).exists() else ():
+    for said, what, advice in _LOADERS if Path(name).is_absolute() and Path(name).exists() else ():
         if match := re.search(said, str(problem).replace(name, "itself"), re.IGNORECASE):
             return what.format(*filter(None, match.groups())), advice.format(*filter(None, match.groups()))
     return "", ""
@@ -86,9 +73,10 @@ def of_port(url: str, problem: BaseException) -> str:
 
 
 NO_TEXT = re.compile(r"[^\t\n\r -~]")  # a character that no text of a device has
+TELNET = re.compile("\xff[\xf0-\xfe]")  # the beginning of its negotiation
 _FOREIGN = (  # searched in the URL, a line end, and what was heard
     (
-        r"^socket:.*\xff[\xf0-\xfe]",  # on a serial line it is noise
+        f"^socket:.*{TELNET.pattern}",  # on a serial line it is noise
         "the server speaks Telnet (FF begins its negotiation)",
         "Set this port of the terminal server to raw TCP: no Telnet, no RFC 2217",
     ),
@@ -117,5 +105,4 @@ _FOREIGN = (  # searched in the URL, a line end, and what was heard
 
 def of_bytes(url: str, heard: str) -> tuple[str, str]:
     """Who speaks on a line in the place of its device, by what was heard (a character a byte), and what to do."""
-    flags = re.IGNORECASE | re.DOTALL
-    return next((row[1:] for row in _FOREIGN if re.search(row[0], f"{url}\n{heard}", flags)), ("", ""))
+    return next((row[1:] for row in _FOREIGN if re.search(f"(?is){row[0]}", f"{url}\n{heard}")), ("", ""))

@@ -197,7 +197,8 @@ class Dcam:
 
     def __init__(self, library: Path | None, device: str) -> None:
         self._device = device
-        name = str(library or installed_library(sys.platform))
+        # A name without a folder is looked for in the folders of the system alone, a path is not.
+        name = str(library.resolve() if library and library.exists() else library or installed_library(sys.platform))
         try_out(name, device)
         try:
             # RTLD_GLOBAL: the camera modules that the library loads resolve their symbols from it.

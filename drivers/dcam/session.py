@@ -9,17 +9,13 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from drivers.base.causes import of_module
+import usb.core
+import usb.util
+
 from drivers.base.errors import DeviceError
 from drivers.dcam import codes
 from drivers.dcam.abi import Dcam, DcamError
 from drivers.dcam.codes import DcamEvent, Error
-
-try:
-    import usb.core
-    import usb.util
-except ImportError as problem:
-    raise of_module("usb", "pyusb", problem) from problem
 
 
 class Session:

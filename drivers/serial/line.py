@@ -21,7 +21,7 @@ from typing import Any
 import serial
 from serial.tools import list_ports
 
-from drivers.base.causes import NO_TEXT, of_bytes, of_port
+from drivers.base.causes import NO_TEXT, TELNET, of_bytes, of_port
 from drivers.base.clock import Clock
 from drivers.base.errors import DeviceError, DeviceRefused, DeviceTimeout
 from drivers.serial.line_reader import CRLF, RECENT_LINES, Damaged, Framing, LineReader, Transcript, readable
@@ -184,8 +184,8 @@ class SerialLine:
                 text = self._reader.reply(self._clock.now() + self._timeout)
             match = re.fullmatch(reply, text) if isinstance(text, str) else None
             words = self._rules.text and isinstance(command, str)  # a control byte may be answered by another one
-            heard = self._reader.heard if self._socket else text  # a server's negotiation may have been discarded
-            if match is not None and not (words and NO_TEXT.search(str(heard))):
+            telnet = self._socket and TELNET.search(self._reader.heard)  # which may have been discarded
+            if match is not None and not (words and (telnet or NO_TEXT.search(match[0]))):
                 self._in_step, self._has_answered, self._reader.heard = True, True, ""
                 self._answered = (request, reply) if self._rules.identified else self._answered
                 return match
@@ -320,7 +320,8 @@ class SerialLine:
 
     def _error(self, kind: type[DeviceError], problem: str, *, advice: str, **parts: str) -> DeviceError:
         """The error, with its cause where the bytes since the last good reply show one."""
-        cause, todo = of_bytes(self._url, self._reader.heard)
+        line_end = self._rules.framing.line_end.decode("latin-1")  # which may be no text
+        cause, todo = of_bytes(self._url, self._reader.heard.replace(line_end, "\n"))
         advice = (todo or advice) + ("" if self._has_answered else self._rules.unanswered)
         wire = self._transcript.recent()
         return kind(self._device, f"{problem}{cause and ': '}{cause}", advice=advice, wire=wire, **parts)

@@ -24,7 +24,7 @@ from recon.base.decisions import Decisions, Stop
 from recon.base.declared_types import Checked, types_of
 from recon.base.geometry import Geometry
 from recon.base.greys import html, middle_slices
-from recon.base.json_values import named, restored
+from recon.base.json_values import plain
 from recon.base.volume import Grid, Volume, VolumeSeries
 
 if TYPE_CHECKING:
@@ -263,15 +263,15 @@ class Reconstruction:
     def save(self, path: str | Path) -> None:
         """Write the volume and its settings to the new file `path`, an .npz; `beamline export` takes it further.
 
-        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON that names NaN and infinities as
-        text. Several volumes in time are there, too: `series` float32 [volume, z, y, x] and `series_s`.
+        As `Volume.save`, with the arrays `method`, `seconds`, and `settings`, JSON in which NaN and infinities are
+        numbers of Python's. Several volumes in time are there, too: `series` float32 [volume, z, y, x] and `series_s`.
         """
         several = {} if self.series is None else {"series": self.series.data, "series_s": self.series.seconds}
         self.volume.save(
             path,
             method=self.method,
             seconds=self.seconds,
-            settings=json.dumps(named(self.settings), allow_nan=False),
+            settings=json.dumps(self.settings, default=plain, allow_nan=True),
             **several,
         )
 
@@ -291,7 +291,7 @@ class Reconstruction:
             grid = Grid(data.shape, edge, tuple(file["centre_zyx_mm"]), None if height == edge else height)
             return cls(
                 Volume(data, grid),
-                restored(json.loads(str(file.get("settings", "{}")))),
+                json.loads(str(file.get("settings", "{}"))),
                 method=str(file.get("method", "")),
                 seconds=float(file.get("seconds", 0.0)),
                 series=VolumeSeries(file["series_s"], file["series"]) if "series" in file else None,

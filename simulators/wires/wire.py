@@ -11,8 +11,10 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, Protocol, Self
 
+import serial
+from serial.serialutil import PortNotOpenError, SerialBase, SerialException, to_bytes
+
 from drivers.base.clock import Clock
-from drivers.serial import serial
 from simulators.devices.trigger_line import TriggerLine
 
 
@@ -129,7 +131,7 @@ def plugged(url: str) -> Wire | None:
         return _WIRES.get(url[len(SCHEME) :])
 
 
-class SimulatedSerial(serial.SerialBase):  # type: ignore[misc]  # pyserial carries no types
+class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no types
     """pyserial's side of a simulated port. Bytes arrive at once, whatever the baud rate; timeouts run on the device's
     clock, so that a virtual second costs nothing."""
 
@@ -137,14 +139,14 @@ class SimulatedSerial(serial.SerialBase):  # type: ignore[misc]  # pyserial carr
 
     def open(self) -> None:
         if self.is_open:
-            raise serial.SerialException("port is already open")
+            raise SerialException("port is already open")
         self._name = self.port[len(SCHEME) :]
         with _LOCK:
             if self._name in _OPEN:
-                raise serial.SerialException(f"could not open port {SCHEME}{self._name}: it is open already")
+                raise SerialException(f"could not open port {SCHEME}{self._name}: it is open already")
             if self._name not in _WIRES:
                 known = ", ".join(SCHEME + known for known in sorted(_WIRES)) or "none"
-                raise serial.SerialException(
+                raise SerialException(
                     f"could not open port {SCHEME}{self._name}: no such simulated port; there are {known}"
                 )
             self._wire = _OPEN[self._name] = _WIRES[self._name]
@@ -176,8 +178,8 @@ class SimulatedSerial(serial.SerialBase):  # type: ignore[misc]  # pyserial carr
 
     def write(self, data: bytes) -> int:
         if not self.is_open:
-            raise serial.PortNotOpenError()
-        sent = serial.to_bytes(data)
+            raise PortNotOpenError()
+        sent = to_bytes(data)
         self._wire.receive(sent)
         return len(sent)
 
@@ -187,7 +189,7 @@ class SimulatedSerial(serial.SerialBase):  # type: ignore[misc]  # pyserial carr
 
     def _take(self) -> None:
         if not self.is_open:
-            raise serial.PortNotOpenError()
+            raise PortNotOpenError()
         self._received += self._wire.transmit()
 
     def _reconfigure_port(self) -> None:

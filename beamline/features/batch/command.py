@@ -203,8 +203,11 @@ def _one(row: BatchRow, place: Path, how: Sequence[str], sink: Sink, clock: Cloc
 def _with_command(message: str, row: BatchRow) -> str:
     """A message of a reconstruction; where it names options, with the command that takes them."""
     named = re.search(r"(?<![\w-])-(-[a-z]|[a-z]\b)", re.sub(r"`beamline [^`]*`", "", message))
-    way = f"Give these options to `beamline recon {row.scan}`, or write them into the recipe where they hold for all."
-    return f"{message} {way}" if named else message
+    return message + (
+        f" Give these options to `beamline recon {row.scan}`, or write them into the recipe where they hold for all."
+        if named
+        else ""
+    )
 
 
 def _read(folder: Path) -> list[BatchRow]:

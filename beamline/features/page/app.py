@@ -138,20 +138,17 @@ def page_routes(reader: Reader, access: Access, log: Callable[[str], None]) -> l
     ]
 
 
-def guarded(start: str | ASGIApp, routes: Sequence[BaseRoute], access: Access) -> Starlette:
-    """An application with these routes, as of `begins_with`, behind the guard."""
+def guarded(start: str, routes: Sequence[BaseRoute], access: Access) -> Starlette:
+    """An application with these routes that starts with a page of `static`, behind the guard."""
     static = Mount("/static", StaticFiles(directory=str(_STATIC)))
     return begins_with(start, [static, *routes], [Middleware(Guard, access=access)])
 
 
-def begins_with(start: str | ASGIApp, routes: Sequence[BaseRoute], middleware: Sequence[Middleware] = ()) -> Starlette:
-    """An application with these routes that starts with a page of `static`, or has another one below all others."""
-    if isinstance(start, str):
-        text = "".join((_STATIC / name).read_text("utf-8") for name in ("head.html", start))
-        routes = [Route("/", lambda request: HTMLResponse(text)), *routes]
-    else:
-        routes = [*routes, Mount("/", start)]
-    return Starlette(routes=routes, middleware=middleware, exception_handlers={BeamlineError: _refused})
+def begins_with(start: str, routes: Sequence[BaseRoute], middleware: Sequence[Middleware] = ()) -> Starlette:
+    """An application with these routes that starts with a page of `static`."""
+    text = "".join((_STATIC / name).read_text("utf-8") for name in ("head.html", start))
+    first = Route("/", lambda request: HTMLResponse(text))
+    return Starlette(routes=[first, *routes], middleware=middleware, exception_handlers={BeamlineError: _refused})
 
 
 def _refused(request: Request, error: Exception) -> Response:

@@ -138,17 +138,22 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
 
 
 def _serve(folder: Path, port: int, bind: str, tethered: bool, browse: bool) -> None:
-    """tethered: of a program that records runs meanwhile, whose newest is shown, to act as well."""
+    """tethered: to the program whose runs these are: it tells their folders, a line each, and its page may act."""
     from beamline.features.page.serve import (
         RunBrowser,  # these load HDF5 and the server
         open_port,
         start,
     )
 
-    with closing(RunBrowser(folder, newest=tethered)) as runs:
+    own = list[Path]()
+    with closing(RunBrowser(folder, own)) as runs:
         server = start(runs.app, open_port(bind, port), control=tethered)
         if tethered:
-            at_end_of(sys.stdin.fileno(), lambda: _end(server))
+            at_end_of(
+                sys.stdin.fileno(),
+                lambda: _end(server),
+                lambda told: own.extend(map(Path, told.decode().splitlines())),
+            )
         serve_shown(server, browse)
 
 

@@ -13,9 +13,9 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -25,7 +25,7 @@ import psutil
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
-from starlette.responses import JSONResponse, RedirectResponse, Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -154,46 +154,36 @@ class RunBrowser:
     """The runs of a folder, numbered: no name from a client reaches the file system.
 
     Args:
-        newest: its address leads to the page of the newest run that has begun since, once one has.
+        own: runs of the program that this page belongs to, the newest one last, while they come. The table leads to
+            that one, and nobody may act on any other run.
     """
 
-    def __init__(self, folder: Path, *, newest: bool = False) -> None:
-        self._before = set(runs_in(folder)) if newest else None
-        self._folder, self._lock = folder, threading.Lock()
+    def __init__(self, folder: Path, own: Sequence[Path] = ()) -> None:
+        self._folder, self._own, self._lock = folder, own, threading.Lock()
         self._access = Access(())
         self._numbers: dict[Path, int] = {}
-        self._opened: dict[int, _Opened] = {}
+        self._opened: dict[tuple[int, bool], _Opened] = {}  # by number, and whether it is an own one
 
     def close(self) -> None:
         for opened in self._opened.values():
             opened.reader.close()
 
     def app(self, access: Access) -> Starlette:
-        """The application; who may act may do so on the pages of its runs."""
+        """The application; who may act may do so on the pages of its own runs."""
         self._access = access
         routes = [Route("/api/runs", self.table), Mount("/run/{number:number}", self.page_of)]
-        return guarded("runs.html" if self._before is None else self.newest, routes, access)
-
-    async def newest(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request as the page of the newest run does; the address itself leads there."""
-        since = [run for run in runs_in(self._folder) if run not in (self._before or ())]
-        if not since:
-            return await begins_with("runs.html", [])(scope, receive, send)
-        with self._lock:
-            number = self._numbers.setdefault(since[0], len(self._numbers))
-        if scope["path"] == "/":
-            return await RedirectResponse(f"/run/{number}/")(scope, receive, send)
-        return await self.page_of({**scope, "path_params": {"number": number}}, receive, send)
+        return guarded("runs.html", routes, access)
 
     def table(self, request: Request) -> Response:
-        """Head and rows, newest first, each with the number of its page and the next step for the run."""
+        """Head and rows, newest first, each with its page's number and the next step; that of the newest own run."""
         with self._lock:
             rows = [
                 {"number": self._numbers.setdefault(run, len(self._numbers)), "cells": cells(it), "next": it.next_step}
                 for run in runs_in(self._folder)
                 for it in [describe(run)]
             ]
-        return JSONResponse({"folder": self._folder.resolve().name, "head": HEAD, "rows": rows})
+        newest = self._numbers.get(self._own[-1]) if self._own else None
+        return JSONResponse({"folder": self._folder.resolve().name, "head": HEAD, "rows": rows, "newest": newest})
 
     async def page_of(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request as the page of a run does."""
@@ -208,14 +198,15 @@ class RunBrowser:
         runs = list(self._numbers)  # by number; a copy, since `table` adds to it in another thread
         if number >= len(runs):
             raise DataError(f"There is no run {number} here.")
-        if number not in self._opened:
+        opened = number, (is_own := runs[number] in self._own)
+        if opened not in self._opened:
             unused = [n for n, opened in self._opened.items() if not opened.requests]
             for n in unused[: len(self._opened) + 1 - OPEN_RUNS]:
                 self._opened.pop(n).reader.close()
             reader = Reader(watched(runs[number]))
-            routes = page_routes(reader, self._access, lambda line: None)
-            self._opened[number] = _Opened(reader, begins_with("index.html", routes))
-        return self._opened[number]
+            routes = page_routes(reader, self._access if is_own else replace(self._access, act=None), lambda line: None)
+            self._opened[opened] = _Opened(reader, begins_with("index.html", routes))
+        return self._opened[opened]
 
 
 @dataclass(frozen=True)

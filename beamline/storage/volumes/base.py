@@ -19,7 +19,6 @@ from beamline.core.installed import version
 from beamline.core.quantities import VoxelKind
 from beamline.storage.readers.tiff import VOLUME
 from beamline.storage.recon_record import ReconRecord
-from recon.base.json_values import named, restored
 from recon.base.volume import Grid, Volume
 
 
@@ -112,8 +111,8 @@ def facts_of(record: ReconRecord, pixels: Pixels) -> dict[str, Any]:
         "voxel_size": grid.voxel_size,
         "slice_pitch": grid.slice_pitch,
         "centre_zyx": grid.centre,
-        "parameters": named({k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray)}),
-        "metrics": named(record.metrics),
+        "parameters": {k: v for k, v in record.parameters.items() if not isinstance(v, np.ndarray)},
+        "metrics": dict(record.metrics),
     }
 
 
@@ -138,7 +137,6 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
         z, y, x = map(float, facts["centre_zyx"])
         pitch = facts["slice_pitch"]
         grid = Grid(values.shape, float(facts["voxel_size"]), (z, y, x), None if pitch is None else float(pitch))
-        parameters = restored(facts["parameters"])  # null: of an earlier version, an infinity or NaN
         window = {"window": np.asarray(facts["window"], float).reshape(2)} if "window" in facts else {}
         return ReconRecord(
             volume=Volume(values, grid),
@@ -147,7 +145,7 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
             title=str(facts["title"]),
             sample=str(facts["sample"]),
             time=datetime.fromisoformat(facts["date"]).timestamp(),
-            parameters={**{name: value for name, value in parameters.items() if value is not None}, **window},
+            parameters={**{k: v for k, v in facts["parameters"].items() if v is not None}, **window},
             metrics={name: math.nan if value is None else float(value) for name, value in facts["metrics"].items()},
             kind=VoxelKind.of_unit(str(facts.get("values"))),
         )

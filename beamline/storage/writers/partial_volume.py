@@ -24,7 +24,7 @@ from beamline.storage.disk_file import reserve
 from beamline.storage.recon_record import ReconRecord, Value
 from beamline.storage.writer_lock import WriterLock, held, opened_whole
 from beamline.storage.writers.recon_file import value_of, write_record
-from recon.base.json_values import named, restored
+from recon.base.json_values import plain
 from recon.base.slabs import Slab
 
 _SLABS = "entry/reconstruction/slabs"
@@ -115,7 +115,7 @@ def create_partial(
             file[_PLACES["state"]] = np.zeros(len(slabs), np.uint8)
             group = file[_SLABS]
             group["table"] = [[s.own.start, s.own.stop, s.slices.start, s.slices.stop, s.fade] for s in slabs]
-            group["kept"] = json.dumps(named(kept), allow_nan=False)  # taken back to the bit
+            group["kept"] = json.dumps(kept, default=plain, allow_nan=True)  # taken back to the bit
             for name, value in made_from.items():
                 group[f"made_from/{name}"] = value
             deepest = max(1, *(len(_shared(slab)) for slab in slabs))
@@ -138,7 +138,7 @@ def open_partial(path: Path) -> PartialVolume:
         group = file[_SLABS]
         slabs = _slabs_in(group)
         made_from = {name: value_of(node) for name, node in group["made_from"].items()}
-        kept = restored(json.loads(group["kept"][()]))
+        kept = json.loads(group["kept"][()])
         maps = {
             name: np.memmap(path, item.dtype, "r+", item.id.get_offset(), item.shape or (1,))
             for name, item in ((name, file[place]) for name, place in _PLACES.items())

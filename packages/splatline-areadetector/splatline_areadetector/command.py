@@ -13,6 +13,7 @@ import click
 from beamline.cli.options import json_events, json_option, set_option
 from beamline.cli.terminal import PageBeside, Terminal
 from beamline.core.errors import AlarmError, BeamlineError
+from beamline.core.events import RunStarted
 from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
@@ -106,7 +107,8 @@ def _ride(
         runs = output or Path(config.storage.folder)
         if page:  # of all its scans, at one address
             runs.mkdir(parents=True, exist_ok=True)
-            held.enter_context(PageBeside(terminal.say)).serve("runs", str(runs), "--page")
+            tell = held.enter_context(PageBeside(terminal.say)).serve("runs", str(runs), "--page")
+            sinks.append(lambda event: tell(f"{event.folder}\n".encode()) if isinstance(event, RunStarted) else None)
         live = None
         if config.recon.live and not no_live:
             live = Standby()

@@ -364,5 +364,6 @@ def seen_of(frame: ArrayFrame, guide: Guide, *, gone: bool = False) -> Seen:
     Args:
         gone: the server had gone since the frame before.
     """
-    is_new = gone or frame.is_current
-    return Seen(frame.unique_id, guide.phase(frame), frame.time, frame.kind, frame.payload, is_new, frame)
+    return Seen(
+        frame.unique_id, guide.phase(frame), frame.time, frame.kind, frame.payload, gone or frame.is_current, frame
+    )

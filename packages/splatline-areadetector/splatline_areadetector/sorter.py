@@ -221,7 +221,7 @@ class Sorter:
         self._taken: dict[int, _Taken] = {}  # by the number of the planned block; extra ones follow
         self._now, self._serial, self._step = -1, 0, 0  # a step of 0 is not known yet
         self._raw = None if before is None else before.number  # the last number as it came
-        self._turned = self._turn = 0
+        self._last_wrap = self._wrapped = 0  # by how much a counter went back at the end of its range: last, in all
         self._last = self._known = before
         self._recent = deque[Seen](maxlen=WINDOW)
         self._size: Any = None
@@ -402,9 +402,13 @@ class Sorter:
             n_left = views.n - 1 - views.trigger(views.last)
             views.closed = seen.number >= views.end if seen.era == views.era else n_left <= WINDOW
         is_later = views is None or views.is_over
-        planned = [(i, each) for i, each in enumerate(self._planned) if each.kind is kind]
-        free = [i for i, _ in planned if i not in self._taken and (is_later or VIEW in self._kinds(i))]
-        n = planned[0][1].n if planned else UNPLANNED
+        kinds = [each.kind for each in self._planned]
+        free = [
+            i
+            for i, each in enumerate(kinds)
+            if each is kind and i not in self._taken and (is_later or VIEW in kinds[i:])
+        ]
+        n = next((each.n for each in self._planned if each.kind is kind), UNPLANNED)
         if kind is VIEW and self._first_id is not None:
             lost, basis = (seen.number - self._first_id) // (self._step or 1), Basis.GIVEN
         elif kind is VIEW:
@@ -412,9 +416,6 @@ class Sorter:
         if lost >= 0:
             i = free[0] if free else max(len(self._planned) - 1, *self._taken, -1) + 1
             self._open(i, PlannedBlock(kind, n), seen.number - lost * (self._step or 1), seen, basis)
-
-    def _kinds(self, after: int) -> list[FrameKind]:
-        return [each.kind for each in self._planned[after:]]
 
     def _open(self, i: int, block: PlannedBlock, first: int, seen: Seen, basis: Basis) -> None:
         step = self._step or 1
@@ -441,7 +442,8 @@ class Sorter:
                 return lost, Basis.COUNTER
         block = self._taken.get(self._now)
         if gap < n and known is not None and block is not None and known.number == block.last == block.end - step:
-            lost = gap - sum(each.n for each in self._planned[self._now + 1 : self._kinds(0).index(VIEW)])
+            before_views = self._planned[self._now + 1 : [each.kind for each in self._planned].index(VIEW)]
+            lost = gap - sum(each.n for each in before_views)
             if 0 <= lost < n:
                 self._note = f"Frames just before {seen.number} were lost: {lost} are taken for the first projections."
                 return lost, Basis.WHOLE
@@ -475,14 +477,14 @@ class Sorter:
         last, self._raw = raw if self._raw is None else self._raw, raw
         for low, top in _RANGES:
             if top - _NEAR <= last <= top and low <= raw <= low + _NEAR and not is_anew:
-                self._turned = top - low + (low != 0 or raw == 0)  # cameras of GigE Vision leave out 0
-                self._turn += self._turned
+                self._last_wrap = top - low + (low != 0 or raw == 0)  # cameras of GigE Vision leave out 0
+                self._wrapped += self._last_wrap
                 if last < top or raw > low + 1:
                     self._note = f"Numbers went from {last} to {raw}: as if the counter had gone on beyond {top}."
-            elif self._turned and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
+            elif self._last_wrap and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
                 self._raw = last  # exchanged with its neighbour
-                return raw + self._turn - self._turned
-        return raw + self._turn
+                return raw + self._wrapped - self._last_wrap
+        return raw + self._wrapped
 
     def pass_over(self, raw: int) -> range:
         """Frames up to this number of the present block will not come; the numbers of those that had not come yet."""

@@ -178,3 +178,24 @@ def test_a_plan_that_ends_before_its_frames_leaves_a_stopped_scan(engine: Any, t
         assert ending_in(file) == ScanEnding(
             "stopped", tuple(range(N)), "0 of 5 frames were taken, as the plan ended before."
         )
+
+
+@pytest.mark.parametrize("n", [0, 2])
+def test_nothing_of_a_staging_stays_with_the_engine(engine: Any, tmp_path: Path, n: int) -> None:
+    """Also of one without a file, and of one whose frames are not all taken."""
+    from bluesky import plan_stubs
+
+    from beamline.bluesky.camera import CameraDetector
+
+    settings = small("recon.live=false", "simulation.clock=virtual")
+
+    def staged(camera: Any) -> Generator[Any, Any, None]:
+        yield from plan_stubs.stage(camera)
+        yield from plan_stubs.unstage(camera, wait=True)
+
+    with ExitStack() as held:
+        camera = CameraDetector(settings, held.enter_context(connect(settings)), tmp_path)
+        before = len(engine.dispatcher._token_mapping)
+        for _ in range(3):
+            engine(_flown(camera, n) if n else staged(camera))
+        assert len(engine.dispatcher._token_mapping) == before

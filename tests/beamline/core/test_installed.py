@@ -37,7 +37,7 @@ def test_a_script_of_the_user_by_the_name_of_a_package(tmp_path: Path) -> None:
     expected = f"Python finds 'recon' at {tmp_path / 'recon.py'}, not splatline's at {ROOT / 'recon/__init__.py'}"
     assert told == f"ImportError: {expected}: rename that one, or work in another folder."
     done = run(command, tmp_path)
-    assert (done.stdout, done.stderr, done.returncode) == ("", told.removeprefix("ImportError: ") + "\n", 1)
+    assert (done.stdout, done.stderr, done.returncode) == ("", told.replace("ImportError", "beamline") + "\n", 2)
 
 
 @pytest.fixture
@@ -121,8 +121,29 @@ def test_a_file_of_the_user_by_the_name_of_a_library(name: str, said: str, tmp_p
     command = tmp_path / "beamline"
     command.write_text("from beamline.cli.main import run\nrun()\n", encoding="utf-8")
     done = run(command, tmp_path)
-    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     assert said in done.stderr and str(file) in done.stderr and "rename that one" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "package"),
+    [
+        ("serial", "class Model: ...", "pyserial"),
+        ("usb", "", "pyusb"),
+        ("usb", "raise ImportError('no backend')", "pyusb"),
+    ],
+)
+def test_a_package_in_the_place_of_one_that_drivers_need(name: str, text: str, package: str, tmp_path: Path) -> None:
+    site = tmp_path / "site-packages"
+    (site / name).mkdir(parents=True)
+    (site / name / "__init__.py").write_text(text, encoding="utf-8")
+    command = tmp_path / "beamline"
+    imports = {"serial": "simulators.wires.wire", "usb": "drivers.dcam.session"}
+    command.write_text(f"import beamline, {imports[name]}\n", encoding="utf-8")
+    done = run(command, site)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert f"the library {name!r} cannot be loaded" in done.stderr
+    assert done.stderr.endswith(f"Install it again: pip install --force-reinstall {package}.\n")
 
 
 @pytest.mark.parametrize("name", ["drivers", "recon"])

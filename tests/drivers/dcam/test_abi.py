@@ -49,6 +49,14 @@ def test_a_missing_library_is_named_with_what_to_do(tmp_path: Path) -> None:
         abi.Dcam(tmp_path / "nowhere.so", "camera")
 
 
+def test_a_library_in_the_working_folder_is_loaded(
+    fake_library: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "libgood.so").write_bytes(fake_library.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    abi.Dcam(Path("libgood.so"), "camera")
+
+
 def test_the_installed_library_has_the_vendor_s_name_on_each_system() -> None:
     assert [abi.installed_library(platform) for platform in ("win32", "linux")] == ["dcamapi.dll", "libdcamapi.so"]
 

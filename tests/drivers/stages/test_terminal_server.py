@@ -11,6 +11,8 @@ import pytest
 
 from drivers.base.clock import SystemClock
 from drivers.base.errors import DeviceError
+from drivers.serial.line import LineRules, Probe, SerialLine
+from drivers.serial.line_reader import Framing
 from tests.drivers.stages.rig import StageRig
 from tests.drivers.stages.rigs import RigOf, every_stage
 from tests.simulators.wires.transports import serve_tcp
@@ -98,3 +100,32 @@ def test_through_raw_tcp_a_stage_is_what_it_is_at_a_cable(rig_of: RigOf) -> None
         stage = rig.open(clock=SystemClock())
         assert stage.position() == 0.0
         stage.close()
+
+
+class Replies:
+    """Says `first` to its client, and `answer` to every message."""
+
+    def __init__(self, first: bytes, answer: bytes) -> None:
+        self.clock, self._out, self._answer = SystemClock(), first, answer
+
+    def receive(self, data: bytes) -> None:
+        self._out += self._answer
+
+    def transmit(self) -> bytes:
+        data, self._out = self._out, b""
+        return data
+
+
+@pytest.mark.parametrize(
+    ("first", "end"), [(b"", b"\x03"), (b"Welcome \xb5-stage\r\n", b"\r\n"), (b"\x07Moxa\r\n", b"\r\n")]
+)
+def test_only_a_reply_must_be_text_and_neither_line_ends_nor_what_a_server_said(first: bytes, end: bytes) -> None:
+    rules = LineRules(Probe("ID", "OK"), framing=Framing(end, end))
+    with serve_tcp(Replies(first, b"OK" + end)) as url:
+        line = SerialLine(url, rules, SystemClock(), device="stage", timeout=1.0, baudrate=9600)
+        with closing(line):
+            time.sleep(2 * NETWORK)
+            assert line.query("ID", "OK", "OK")[0] == "OK"
+            with pytest.raises(DeviceError, match="have the form") as told:
+                line.query("ID", "NO", "NO")
+            assert "no text" not in str(told.value)

@@ -313,7 +313,7 @@ function header(now) {
   if (now.status === "running") shown["last frame"] = `${now.age_s.toFixed(0)} s ago`;
   if (curves.beam.y.length) shown.beam = `${curves.beam.y[curves.beam.y.length - 1].toPrecision(4)} ${curves.beam.unit}`;
   if (fit && now.status === "running") shown.volume = `${fit.n_views} views${fit.waiting ? `, ${fit.waiting} wait` : ""}, ${(fit.step / fit.views).toFixed(1)} steps a view, ${fit.n_gaussians} Gaussians`;
-  else if (work && work.steps && work.step < work.steps) shown.volume = `last round: ${work.step} of ${work.steps} ${work.unit || "steps"}${work.eta_s === null ? "" : `, ${duration(work.eta_s)} left for these`}`;
+  else if (work && work.steps && work.step < work.steps) shown.volume = `last round: ${work.step} of ${work.steps} ${work.unit || "steps"}${work.eta_s === null ? "" : `, ${duration(work.eta_s)} left for this step`}`;
   shown["free disk"] = `${(now.free / 1e9).toFixed(1)} GB`;
   $("figures").replaceChildren(...Object.entries(shown).map(([name, value]) => { const box = element("div", ""); box.append(element("dt", name), element("dd", value)); return box; }));
   const over = now.status !== "running" && now.status !== "preparing";

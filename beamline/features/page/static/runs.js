@@ -1,7 +1,7 @@
 // The runs of a folder as a table, newest first; the name of a folder leads to the page of its run.
 const $ = (name) => document.querySelector(name);
 const PERIOD = 3000;  // ms
-let said = "", known = -1;
+let said = "";
 if (location.hash.startsWith("#act=")) { sessionStorage.setItem("act", location.hash.slice(5)); history.replaceState(null, "", location.pathname); }
 
 function row(cells, kind, link = null) {
@@ -23,9 +23,8 @@ async function show() {
     if (!answer.ok) throw new Error(text);
     if (text === said) return;
     said = text;
-    const { folder, head, rows } = JSON.parse(text);
-    if (known >= 0 && rows.length > known) location.reload();  // beside a program that records: to the page of the run
-    known = rows.length;
+    const { folder, head, rows, newest } = JSON.parse(text);
+    if (newest !== null) location.replace(`run/${newest}/`);  // of the program that records: to the page of its run
     document.title = `Runs in ${folder}`;
     $("#folder").textContent = `${rows.length} ${rows.length === 1 ? "run" : "runs"} in ${folder}`;
     $("thead").replaceChildren(row(head, "th"));

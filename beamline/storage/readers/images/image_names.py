@@ -195,8 +195,9 @@ def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_ser
 def _rank(name: str) -> int:
     """Where the frames of a kind stand in a scan: darks, flats, views, and references that were taken afterwards."""
     kind = _kind_of(name)
-    place = (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION).index(kind)
-    return place + 3 * (kind in _REFERENCES and _AFTER.search(name.lower()) is not None)
+    return (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION).index(kind) + 3 * (
+        kind in _REFERENCES and _AFTER.search(name.lower()) is not None
+    )
 
 
 def _template(name: str, doubt: str = "") -> str:
@@ -247,10 +248,9 @@ def _frame_numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
 
 def places_of(names: Sequence[str]) -> str:
     """Which places in a scan the images of each name have, such as "dark_#.tif 0:5, s_#.tif 5:95"."""
-    of_names = groupby(enumerate(names), lambda each: re.sub(r"\d+", "#", each[1]))
-    runs = [(name, [place for place, _ in some]) for name, some in of_names]
-    listed = [f"{name} {places[0]}:{places[-1] + 1}" for name, places in runs[:_LISTED]]
-    return ", ".join(listed) + ", ..." * (len(runs) > _LISTED)
+    of_names = groupby(range(len(names)), lambda place: re.sub(r"\d+", "#", names[place]))
+    runs = [f"{name} {places[0]}:{places[-1] + 1}" for name, some in of_names for places in [[*some]]]
+    return ", ".join(runs[:_LISTED]) + ", ..." * (len(runs) > _LISTED)
 
 
 _LISTED = 6  # series that a sentence names
@@ -263,8 +263,8 @@ def _several_series(path: object, names: Sequence[str], images: Sequence[str]) -
     numbers = ", ".join(f"{templates.count(kind)} of {kind!r}" for kind in sorted(set(templates))[:_LISTED])
     places = ""
     with suppress(DataError):  # no order where the same names are several series again
-        in_their_order = in_order(path, images, one_series=True).names if images else []
-        places = f", counted from 0 in this order: {places_of(in_their_order)}" * bool(images)
+        if images:
+            places = f", counted from 0 in this order: {places_of(in_order(path, images, one_series=True).names)}"
     return (
         f"{path} holds several series of images: {numbers}. Name darks and flats so (dark_0001.tif, flat_0001.tif), or "
         "give the folder of the projections, and the others apart, with --darks and --flats. Or say which images are "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -75,7 +76,7 @@ class TiffFolderVolume:
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
         path.mkdir()
-        tags = _tags(record, facts_of(record, slices.pixels))
+        tags = _tags(record, json.loads(json_of(facts_of(record, slices.pixels))))
         for z, values in enumerate(slices):
             tags["metadata"] |= {"slice": z, "slices": slices.shape[0]}
             tifffile.imwrite(_slice(path, z), values, **tags)

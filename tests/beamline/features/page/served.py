@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import http.client
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
@@ -45,11 +45,12 @@ def viewed(*paths: Path, held: int = HELD) -> Iterator[Served]:
 
 
 @contextmanager
-def listed(folder: Path) -> Iterator[Served]:
-    """The page of a folder of runs."""
+def listed(folder: Path, own: Sequence[Path] | None = None) -> Iterator[Served]:
+    """The page of a folder of runs; own: beside the program that records these."""
     with ExitStack() as opened:
-        runs = opened.enter_context(closing(RunBrowser(folder)))
-        yield opened.enter_context(_running(start(runs.app, open_port("127.0.0.1", 0))))
+        runs = opened.enter_context(closing(RunBrowser(folder, () if own is None else own)))
+        server = start(runs.app, open_port("127.0.0.1", 0), control=own is not None)
+        yield opened.enter_context(_running(server))
 
 
 @contextmanager

@@ -95,6 +95,36 @@ def test_a_page_of_a_run_has_the_same_rules(tmp_path: Path) -> None:
             assert page.ask(path)[0] == 404
 
 
+def test_who_records_runs_may_act_on_these_alone(tmp_path: Path) -> None:
+    """And the table leads to the newest of them, whatever runs others record in the folder."""
+    first, foreign = made(tmp_path, 1, "first"), made(tmp_path, 9, "of another process")
+    own: list[Path] = []
+    with listed(tmp_path, own) as page:
+
+        def newest() -> int | None:
+            number: int | None = json.loads(page.ask("/api/runs")[2])["newest"]
+            return number
+
+        def told(run: Path) -> tuple[bool, int]:
+            """Whether its page says that it may act, and the status of an answer to a stop."""
+            numbers = {row["cells"][-1]: row["number"] for row in rows(page)}
+            root = f"/run/{numbers[run.name]}"
+            act = (page.addresses.act or "").partition("#act=")[2]
+            headers = {"Origin": f"http://{page.host}", "X-Act-Token": act}
+            answer = page.ask(f"{root}/api/verb/stop", "POST", headers=headers)
+            return json.loads(page.ask(f"{root}/api/facts")[2])["may_act"], answer[0]
+
+        assert newest() is None and told(first) == told(foreign) == (False, 403)
+        own.append(first)
+        assert told(first) == (True, 404)  # it does not run any more
+        assert told(foreign) == (False, 403)
+        numbers = {row["cells"][-1]: row["number"] for row in rows(page)}
+        assert newest() == numbers[first.name]
+        own.append(made(tmp_path, 5, "second"))
+        rows(page)
+        assert newest() == 2
+
+
 SECRET = b"-----BEGIN PRIVATE KEY-----"
 
 
