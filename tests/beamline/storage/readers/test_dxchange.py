@@ -230,4 +230,4 @@ def test_start_and_step_of_the_rotation_stand_for_theta(tmp_path: Path, parts: P
     else:
         with open_scan(path) as source:
             np.testing.assert_allclose(np.degrees(source.table.angles[-5:]), 10 + 36 * np.arange(5))
-            assert "start and step of the rotation" in source.attributes["angles_from"]
+            assert "start and step of the rotation" in str(source.attributes["angles_from"])
