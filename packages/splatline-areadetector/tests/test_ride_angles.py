@@ -92,7 +92,7 @@ def test_a_camera_that_ran_free_before_the_projections(tmp_path: Path, pause: fl
     said = f"{told.error}{told.warnings}"
     if lost and not pause:
         assert file.ids.tolist() == [*range(32, 91)] and "Nothing tells whether frame 32 is the first" in said
-        assert "it may be the first 1 that are missing" in said
+        assert "it may be the first that is missing" in said
     else:
         assert np.allclose(file.degrees, 3.0 * (file.ids - 31)) and file.missing == [*range(lost)]
         assert (told.error is None) is (lost == 0) and "Nothing tells" not in said

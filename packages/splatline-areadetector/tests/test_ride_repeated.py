@@ -26,7 +26,7 @@ WAITING = "Waiting for the first frame"
     [
         ([range(1, 21), range(21, 41)], False, 0, "Recorded: 2 scans, of which 0 lack frames."),
         ([range(1, 21), [*range(21, 31), *range(32, 41)], range(41, 61)], False, 5,
-         "Recorded: 3 scans, of which 1 lacks frames. The last such: 1 of 20 projections are missing: 10"),
+         "Recorded: 3 scans, of which 1 lacks frames. The last such: 1 of 20 projections is missing: 10"),
         ([range(1, 21)], True, 4, "Recorded: 1 scan before this one, of which 0 lack frames."),
     ],
 )  # fmt: skip
@@ -43,6 +43,7 @@ def test_scan_after_scan_until_ctrl_c(
         ride.process.send_signal(signal.SIGINT)
         assert ride.exit_code(60) == code, ride.output
         assert sentence in " ".join(ride.output.split())
+        assert len(re.findall("^file ", ride.output, re.MULTILINE)) == sum(len(ids) == 20 for ids in scans)
     files = stored(tmp_path)
     assert [file.ids.tolist() for file in files[: len(scans)]] == [[*ids] for ids in scans]
     assert [file.status for file in files[: len(scans)]] == [
