@@ -346,8 +346,10 @@ class RiddenFrames:
         )
 
     def _raise_outcome(self) -> None:
-        is_cut = self._stop.stopping and self._silence.lasted < SECOND  # else no frame came any more before the stop
-        ended = not (is_cut or self._epoch)
+        since = math.inf if self._arrived is None else time.time() - self._arrived.received
+        ended = not (
+            self._epoch or (self._stop.stopping and since < SECOND)
+        )  # a stop long after the last frame ends none
         told, planned = self._told(ended=ended), self._plan.angles.size
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{told}")

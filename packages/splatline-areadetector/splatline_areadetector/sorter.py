@@ -512,7 +512,7 @@ class Sorter:
                 self._turned = top - low + (low != 0 or raw == 0)  # cameras of GigE Vision leave out 0
                 self._turn += self._turned
                 times = [each.time for each in (*self._recent, *self.held)]
-                is_long = len(times) > 1 and time - times[-1] > 1.5 * max(b - a for a, b in pairwise(times))
+                is_long = len(times) > 2 and time - times[-1] > 1.5 * float(np.median(np.diff(times)))
                 if last < top or raw > low + 1 or (raw != low and is_long):
                     left_out = "" if self._turned > top - low else f", and {low} is taken for left out"
                     self._note = (

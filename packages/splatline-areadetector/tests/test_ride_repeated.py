@@ -51,6 +51,19 @@ def test_scan_after_scan_until_ctrl_c(
     ]
 
 
+def test_a_scan_that_follows_at_once_keeps_its_first_frames(tmp_path: Path) -> None:
+    """The last projection but one was lost, so that the last one waited while the next scan began."""
+    with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", angles=PLAN) as ride:
+        for ids in (range(1, 19), range(20, 41)):
+            ioc.send(ids)
+        ride.wait_for(lambda: ride.output.count(WAITING) >= 3)
+        ride.process.send_signal(signal.SIGINT)
+        assert ride.exit_code(60) == 5, ride.output
+    one, other = stored(tmp_path)
+    assert one.missing == [18] and one.ids.tolist() == [*range(1, 19), 20]
+    assert other.ids.tolist() == [*range(21, 41)] and other.degrees.tolist() == [9.0 * i for i in range(20)]
+
+
 def test_ctrl_c_before_any_scan_says_that_nothing_was_recorded(tmp_path: Path) -> None:
     with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", angles=PLAN) as ride:
         ride.process.send_signal(signal.SIGINT)
