@@ -347,9 +347,7 @@ class RiddenFrames:
 
     def _raise_outcome(self) -> None:
         since = math.inf if self._arrived is None else time.time() - self._arrived.received
-        ended = not (
-            self._epoch or (self._stop.stopping and since < SECOND)
-        )  # a stop long after the last frame ends none
+        ended = not (self._epoch or (self._stop.stopping and since < SECOND))  # a later stop cut nothing off
         told, planned = self._told(ended=ended), self._plan.angles.size
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{told}")

@@ -303,7 +303,7 @@ class Sorter:
         if last is not None and block is not None:
             if (is_anew or self._is_another_count(seen, last)) and (why := self._new_epoch(seen, last, block)):
                 return NewEpoch(why)
-            if not is_anew and (not self._step or self._is_step_wrong(seen, block)):
+            if not is_anew and (not self._step or self._is_step_wrong(seen, last, block)):
                 self._learn_step(seen, last, block)
         place = self._place(seen, block, is_anew)
         self._size, self._last = seen.size, seen
@@ -367,9 +367,10 @@ class Sorter:
             )
         self._step = block.step = step
 
-    def _is_step_wrong(self, seen: Seen, block: _Taken) -> bool:
-        """Whether more numbers than one are between those of the step."""
-        ahead = [each for each in (seen, *self.held) if each.count_restarts == block.count_restarts]
+    def _is_step_wrong(self, seen: Seen, last: Seen, block: _Taken) -> bool:
+        """Whether more numbers of the same acquisition than one are between those of the step."""
+        now = (last.count_restarts, last.phase)
+        ahead = [each for each in (seen, *self.held) if (each.count_restarts, each.phase) == now]
         return sum((each.number - block.first) % block.step > 0 for each in ahead) > 1
 
     def _place(self, seen: Seen, block: _Taken | None, is_anew: bool) -> Decision:
@@ -470,12 +471,11 @@ class Sorter:
                 words = count(lost, noun)
                 self._note = f"The camera had counted {words} before the first that came." if lost else self._note
                 return lost, Basis.COUNTER
-        is_late = (
-            (self._began_within_scan and not self._taken)
-            or seen.reconnected
-            or gap < n
-            or (is_anew and seen.number > 1)
-        )
+        is_said = seen.phase == BY_ORDER and bool(
+            self._taken
+        )  # of the file's first block, from which the others follow
+        is_late = (self._began_within_scan and not is_said) or seen.reconnected
+        is_late = is_late or gap < n or (is_anew and seen.number > 1)
         if not (is_late or is_anew or is_other) and known is not None and second is not None:
             is_late = seen.time - known.time <= _RUNNING * (second.time - seen.time)
         if is_late:

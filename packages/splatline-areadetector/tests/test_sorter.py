@@ -287,6 +287,14 @@ def test_a_step_learned_from_frames_of_which_every_second_was_lost_is_revised() 
     assert {i: i - 5 for i in range(12, 25)}.items() <= triggers(decided).items() and sorter.complete
 
 
+def test_a_count_that_goes_on_between_acquisitions_by_no_multiple_of_the_step_revises_nothing() -> None:
+    decided = sort(Sorter([PlannedBlock(FLAT, 4), PlannedBlock(VIEW, 6)]), [
+        *seen(range(5, 25, 5), FLATS), *seen(range(33, 63, 5), VIEWS)
+    ])  # fmt: skip
+    assert triggers(decided, FLAT) == {5 * i + 5: i for i in range(4)}
+    assert triggers(decided) == {33 + 5 * i: i for i in range(6)} and "not by 5" not in notes(decided)
+
+
 def test_first_frames_that_were_lost_where_kinds_go_by_order() -> None:
     """All kinds and angles may be shifted: frames are missing at the end of the whole plan."""
     blocks = [PlannedBlock(DARK, 3), PlannedBlock(FLAT, 3), PlannedBlock(VIEW, 8), PlannedBlock(FLAT, 3)]
@@ -317,6 +325,9 @@ def test_the_kind_of_the_first_frame_of_a_second_file_is_assumed_by_order() -> N
     told = notes(sort(sorter, [*seen(range(1, 3), BY_ORDER), *seen(range(1, 6), BY_ORDER)]))
     assert "whether frame 1 is the first dark of the scan" in told and "the kinds of frames and all angles" in told
     assert told.count("Nothing tells") == 1
+    sorter = Sorter(BLOCKS, before=Seen(9, VIEWS), began_within_scan=True)  # a second file that begins with darks
+    told = notes(sort(sorter, [*seen((1, 2), DARKS), *seen(range(1, 6), VIEWS)]))
+    assert "whether frame 1 is the first projection" in told
 
 
 def test_more_flats_within_the_projections_than_planned_are_stored() -> None:
