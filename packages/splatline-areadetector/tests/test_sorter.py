@@ -288,11 +288,11 @@ def test_a_step_learned_from_frames_of_which_every_second_was_lost_is_revised() 
 
 
 def test_a_count_that_goes_on_between_acquisitions_by_no_multiple_of_the_step_revises_nothing() -> None:
-    decided = sort(Sorter([PlannedBlock(FLAT, 4), PlannedBlock(VIEW, 6)]), [
-        *seen(range(5, 25, 5), FLATS), *seen(range(33, 63, 5), VIEWS)
+    decided = sort(Sorter([PlannedBlock(FLAT, 8), PlannedBlock(VIEW, 6)]), [
+        *seen(range(5, 45, 5), FLATS), *seen(range(53, 83, 5), VIEWS)
     ])  # fmt: skip
-    assert triggers(decided, FLAT) == {5 * i + 5: i for i in range(4)}
-    assert triggers(decided) == {33 + 5 * i: i for i in range(6)} and "not by 5" not in notes(decided)
+    assert triggers(decided, FLAT) == {5 * i + 5: i for i in range(8)}
+    assert triggers(decided) == {53 + 5 * i: i for i in range(6)} and "not by 5" not in notes(decided)
 
 
 def test_first_frames_that_were_lost_where_kinds_go_by_order() -> None:
