@@ -77,10 +77,13 @@ def ride(
         click.echo("\n".join(check(config)))
         return
     given = load_given(darks, flats)
-    with json_events(as_json) as json_sink:
-        results = _ride(config, given, [json_sink], **more)  # type: ignore[arg-type]
-    if not as_json:
-        click.echo("\n".join(_lines(result) for result in results))
+    results = list[RunResult]()
+    try:
+        with json_events(as_json) as json_sink:
+            _ride(config, given, results, [json_sink], **more)  # type: ignore[arg-type]
+    finally:
+        if results and not as_json:
+            click.echo("\n".join(_lines(result) for result in results))
     if alarmed := sum(result.alarmed_frames for result in results):
         raise AlarmError(f"The scan is complete, but {alarmed} frames have an alarm of the monitor.")
 
@@ -88,18 +91,20 @@ def ride(
 def _ride(
     config: RideConfig,
     given: object,
+    results: list[RunResult],
     others: list[Sink],
     *,
     page: bool,
     no_live: bool,
     repeat: bool,
     output: Path | None,
-) -> list[RunResult]:
+) -> None:
+    """Record the next scan, or with `repeat` one after the other; those that are whole come into `results`."""
     from beamline.scan.live_process import Standby
     from splatline_areadetector.ridden import Ride
     from splatline_areadetector.ride import NoScanError, opened, ride_scan
 
-    stop, results, lacking = StopRequest(), list[RunResult](), list[LedgerError]()
+    stop, lacking = StopRequest(), list[LedgerError]()
     with ExitStack() as held:
         held.enter_context(stop_signals(stop))
         terminal = held.enter_context(Terminal(sys.stderr))
@@ -127,9 +132,9 @@ def _ride(
                 if not (results or lacking):
                     raise
                 _raise_worst("" if isinstance(error, NoScanError) else error, len(results), lacking, terminal.say)
-                return results
+                return
             if not repeat:
-                return results
+                return
 
 
 def _raise_worst(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,13 +73,13 @@ class RiddenFrames:
     recovered, unsafe = 0, False
 
     def __init__(
-        self, ride: Ride, plan: RidePlan, first_id: int | None, before: Seen | None, joined: bool,
+        self, ride: Ride, plan: RidePlan, first_id: int | None, before: Seen | None, began_within_scan: bool,
         measurement: Measurement,
     ) -> None:  # fmt: skip
         self._ride, self._plan, self._measurement = ride, plan, measurement
         self._stream, self._guide = ride.stream, ride.guide
         self._sink, self._stop = measurement.sink, measurement.stop
-        self._sorter = Sorter(plan.blocks, first_id, ride.counters, before, joined=joined)
+        self._sorter = Sorter(plan.blocks, first_id, ride.counters, before, began_within_scan=began_within_scan)
         self._gaps: list[Gap] = []
         self._overflowed: set[int] = set()
         self._last: ArrayFrame | None = None  # that has a place
@@ -105,7 +105,8 @@ class RiddenFrames:
         """See `FrameSource`. LedgerError names the frames that are missing, and whose loss they are."""
         yield from self._from_files()
         yield from self._from_stream()
-        yield from self._stored(self._sorter.decided(0))
+        if not self._sorter.complete:  # else what is held is the next scan's
+            yield from self._stored(self._sorter.decided(0))
         for seen in reversed(self._sorter.held):
             self._stream.put_back(seen.frame)
         self._stream.first = self._last or self._stream.first
@@ -304,39 +305,49 @@ class RiddenFrames:
                 if block.kind is FrameKind.PROJECTION and not np.isnan(angles).any():
                     first, last = (math.degrees(angles[missing[end]]) for end in (0, -1))
                     at = f" (from {first:.4g}° to {last:.4g}°)"
-                words.append(f"{len(missing)} of {block.n} {noun}s are missing: {spans(missing)}{at}.")
-                if block.kind is FrameKind.PROJECTION and self._plan.told_by != "attribute":
-                    words.append(self._first_or_last(missing, ended))
+                are = "is" if len(missing) == 1 else "are"
+                words.append(f"{len(missing)} of {block.n} {noun}s {are} missing: {spans(missing)}{at}.")
+        words.append(self._first_or_last(ended))
         for why, ids in self._unused.items():
-            words.append(f"{count(len(ids), 'frame')} came ({spans(ids)}) that did not count: {why}.")
+            words.append(f"{count(len(ids), 'frame')} came ({spans(ids)}) but could not be used: {why}.")
         if self._unused and self._guide.status:
             words.append(f"Now: {self._guide.status}.")
         words += losses_told(self._gaps, self._overflowed, self._ride.counters)
         if self._sorter.repeats:
             words.append(f"{count(self._sorter.repeats, 'frame')} came twice and were stored once.")
-        words += [f"Frames {spans(sorted(ids))} have no place: {why}." for why, ids in self._unplaced.items()]
+        for why, ids in self._unplaced.items():
+            frames = "Frame {} has" if len(ids) == 1 else "Frames {} have"
+            words.append(f"{frames.format(spans(sorted(ids)))} no place: {why}.")
         return "".join(f" {sentence}" for sentence in words if sentence)
 
-    def _first_or_last(self, missing: Sequence[int], ended: bool) -> str:
-        """A sentence on projections that are missing at the end: "" where the number of the first one is known, or
-        where a stop of a ride that waited for the first one tells why.
+    def _first_or_last(self, ended: bool) -> str:
+        """A sentence on frames that are missing at the end: "" where the number of the first one is known, or where a
+        stop while frames came, of a ride that waited for the first one, tells why.
 
         No view shows it: the same turn of all angles gives the same views of a turned sample.
         """
-        angles, basis = self._plan.angles, self._sorter.basis
-        n = next((i for i, trigger in enumerate(reversed(missing)) if trigger != angles.size - 1 - i), len(missing))
-        if n in (0, angles.size) or basis.is_sure or (basis is Basis.WAITED and not ended):
+        angles, basis, n = self._plan.angles, self._sorter.basis, self._sorter.n_left
+        if n == 0 or not self._views or basis.is_sure or (basis is Basis.WAITED and not ended):
             return ""
-        off = (
-            f"{math.degrees(angles[n] - angles[0]):.4g}° more" if not np.isnan(angles).any() else f"those of {n} later"
-        )
+        off = f"all angles are those of {n} later"
+        if n < angles.size and not np.isnan(angles).any():
+            off = f"all angles are {math.degrees(angles[n] - angles[0]):.4g}° more"
+        has_angles = self._plan.told_by == "attribute"
+        if self._sorter.is_by_order and len(self._plan.blocks) > 1:
+            off = "" if has_angles else f", and {off}"
+            off = f"frames next to those of another kind have the wrong kind{off}. ride.kinds"
+        elif has_angles:
+            return ""
+        else:
+            off = f"{off}, by which the volume is turned, and nothing else. ride.camera"
         return (
-            f"As nothing tells the number of the first one, it may be the first {n} that are missing: then all angles "
-            f"are {off}, by which the volume is turned, and nothing else. ride.camera or ride.first_id tells it."
+            "As nothing tells the number of the first one, it may be the first "
+            f"{'that is' if n == 1 else f'{n} that are'} missing: then {off} or ride.first_id tells it."
         )
 
     def _raise_outcome(self) -> None:
-        ended = not (self._stop.stopping or self._epoch)
+        since = math.inf if self._arrived is None else time.time() - self._arrived.received
+        ended = not (self._epoch or (self._stop.stopping and since < SECOND))  # a later stop cut nothing off
         told, planned = self._told(ended=ended), self._plan.angles.size
         if self._stop.aborting:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{told}")

@@ -56,7 +56,7 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> Run
     while True:
         if live is not None:
             live.prepare()
-        first, before = wait_for_scan(ride, first_id, joined=lost is not None)
+        first, before = wait_for_scan(ride, first_id, began_within_scan=lost is not None)
         refuse_mistakes(ride.config, ride.counters, first)
         own = _with_exposure(ride.guide.plan(), ride, first)
         plan = _with_given(own, ride.given, first.window.shape)
@@ -72,11 +72,11 @@ def ride_scan(ride: Ride, sinks: Sequence[Sink], *, live: Standby | None) -> Run
         return result
 
 
-def wait_for_scan(ride: Ride, first_id: int | None, *, joined: bool) -> tuple[ArrayFrame, Seen | None]:
+def wait_for_scan(ride: Ride, first_id: int | None, *, began_within_scan: bool) -> tuple[ArrayFrame, Seen | None]:
     """The first frame of a scan, which the stream still has, and the one before it; those before it are dropped.
 
     Args:
-        joined: a file has ended within the scan.
+        began_within_scan: a file has ended within the scan.
 
     Raises:
         NoScanError: a stop was requested.
@@ -87,7 +87,7 @@ def wait_for_scan(ride: Ride, first_id: int | None, *, joined: bool) -> tuple[Ar
     silence = Silence(stream, ride.counters, ride.config.ride.silence_s, ride.say, lambda: "Nothing was recorded.")
     told, known = False, stream.first
     before = None if known is None else Seen(known.unique_id, BY_ORDER, known.time)
-    if joined and known is not None:
+    if began_within_scan and known is not None:
         before = seen_of(known, guide)
     now = f" Now: {guide.status}." if guide.status else ""
     ride.say(f"Waiting for the first frame of a scan from {stream.name}{_shown(ride)}{now}")

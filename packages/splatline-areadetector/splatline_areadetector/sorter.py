@@ -25,6 +25,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from beamline.core.errors import DataError
+from beamline.core.text import count
 from drivers.base.frame import FrameKind
 from splatline_areadetector.plan import PlannedBlock
 
@@ -64,7 +65,7 @@ class Seen:
         pixels: compared with those of a frame of the same number.
         reconnected: the server had gone since the frame before, or came with this one when it was asked.
         frame: goes with it.
-        era: how often the numbers had begun anew; the sorter sets it.
+        count_restarts: how often the numbers had begun anew; the sorter sets it.
     """
 
     number: int
@@ -74,7 +75,7 @@ class Seen:
     pixels: Any = None
     reconnected: bool = False
     frame: Any = None
-    era: int = 0
+    count_restarts: int = 0
 
     def repeats(self, other: Seen, *, is_last: bool) -> bool:
         """Whether it is the same frame as one of its number, sent once more: at once, or later with the same time."""
@@ -88,7 +89,6 @@ class Basis(Enum):
     GIVEN = "as ride.first_id says"
     NUMBERS = "as its number follows that of the frame before the block"
     COUNTER = "as the camera's own count says"
-    WHOLE = "as the block before is whole, and lost numbers after it are this block's"
     WAITED = "the first that came"
     UNKNOWN = "the first that came, although others may have come before it"
 
@@ -159,18 +159,18 @@ Decision = Place | Outside | Unknown | NewEpoch
 
 @dataclass
 class _Taken:
-    """A block and the triggers that came; `away`: the first frame of another kind after its last one."""
+    """A block and the triggers that came; `first_frame_of_other_kind`: the one after its last frame."""
 
     kind: FrameKind
     n: int
     first: int
     step: int
     last: int
-    era: int
+    count_restarts: int
     basis: Basis
     triggers: set[int] = field(default_factory=set)
     closed: bool = False
-    away: Seen | None = None
+    first_frame_of_other_kind: Seen | None = None
 
     def trigger(self, number: int) -> int:
         return (number - self.first) // self.step
@@ -179,6 +179,11 @@ class _Taken:
     def end(self) -> int:
         """Number of the first frame beyond the plan."""
         return self.first + self.n * self.step
+
+    @property
+    def n_left(self) -> int:
+        """Frames after the last one."""
+        return (self.end - self.last) // self.step - 1
 
     @property
     def is_over(self) -> bool:
@@ -206,7 +211,7 @@ class Sorter:
         first_id: number of the first projection; None: it follows from what is known.
         witness: counters of the IOC; None: it has none.
         before: the last frame before the first one.
-        joined: the scan may have begun before: its numbers began anew within it.
+        began_within_scan: the scan may have begun before: its numbers began anew within it.
 
     Attributes:
         repeats: frames that came twice.
@@ -215,9 +220,10 @@ class Sorter:
 
     def __init__(
         self, blocks: Sequence[PlannedBlock], first_id: int | None = None, witness: Witness | None = None,
-        before: Seen | None = None, *, joined: bool = False,
+        before: Seen | None = None, *, began_within_scan: bool = False,
     ) -> None:  # fmt: skip
-        self._planned, self._first_id, self._witness, self._joined = tuple(blocks), first_id, witness, joined
+        self._planned, self._first_id, self._witness = tuple(blocks), first_id, witness
+        self._began_within_scan = began_within_scan
         self._taken: dict[int, _Taken] = {}  # by the number of the planned block; extra ones follow
         self._now, self._serial, self._step = -1, 0, 0  # a step of 0 is not known yet
         self._raw = None if before is None else before.number  # the last number as it came
@@ -233,31 +239,36 @@ class Sorter:
         """Take the next frame. Where each frame that waits no longer belongs, in the order of their numbers: see
         `decided`."""
         newest = self.held[-1] if self.held else self._last
-        number = self._unwrapped(seen.number, is_anew=seen.reconnected)
-        era = 0 if newest is None else newest.era
-        same = [each for each in (*self._recent, *self.held) if (each.number, each.era) == (number, era)]
+        number = self._unwrapped(seen.number, seen.time, is_anew=seen.reconnected)
+        restarts = 0 if newest is None else newest.count_restarts
+        nearby = [*self._recent, *self.held]
+        same = [each for each in nearby if (each.number, each.count_restarts) == (number, restarts)]
         if same and not seen.reconnected and seen.repeats(same[-1], is_last=same[-1] is newest):
             self.repeats += 1
             yield replace(seen, number=number), Outside(repeated=True)
             return
         if newest is not None and number <= newest.number:
-            era = self._era_of(seen, number, newest) + bool(same)
-        insort(self.held, replace(seen, number=number, era=era), key=lambda each: (each.era, each.number))
+            restarts = self._count_restarts_of(seen, number, newest) + bool(same)
+        now = replace(seen, number=number, count_restarts=restarts)
+        insort(self.held, now, key=lambda each: (each.count_restarts, each.number))
         yield from self.decided(2)
 
-    def _era_of(self, seen: Seen, number: int, newest: Seen) -> int:
-        """The era of a frame whose number is not beyond that of the newest one: exchanged, or numbered anew."""
+    def _count_restarts_of(self, seen: Seen, number: int, newest: Seen) -> int:
+        """Of a frame whose number is not beyond that of the newest one: exchanged, or numbered anew. With a frame of
+        another phase only direct neighbours are exchanged."""
         last, step = self._last, self._step or 1
-        one_before = [each.number for each in self.held[:-1] if each.era == newest.era]
+        is_other = seen.phase != newest.phase and NOT_TOLD not in (seen.phase, newest.phase)
+        one_before = [each.number for each in self.held[:-1] if each.count_restarts == newest.count_restarts]
         if seen.reconnected:
-            return newest.era + 1
-        if last is not None and last.era == newest.era:
-            return newest.era + (number <= last.number or number < newest.number - WINDOW * step)
+            return newest.count_restarts + 1
+        if last is not None and last.count_restarts == newest.count_restarts:
+            most = step if is_other else WINDOW * step
+            return newest.count_restarts + (number <= last.number or number < newest.number - most)
         if last is not None and len(self.held) == 1 and seen.phase == last.phase != newest.phase:
-            return newest.era - (number == last.number + step)
+            return newest.count_restarts - (number == last.number + step)
         if one_before:
-            return newest.era + (number <= one_before[-1])
-        return newest.era + (seen.phase != newest.phase or number < newest.number - step)
+            return newest.count_restarts + (number <= one_before[-1])
+        return newest.count_restarts + (seen.phase != newest.phase or number < newest.number - step)
 
     def decided(self, patience: int) -> Iterator[tuple[Seen, Decision]]:
         """Where each frame that waits no longer belongs.
@@ -277,9 +288,10 @@ class Sorter:
         seen, last = self.held[0], self._last
         if self._size not in (None, seen.size):
             return patience > 0 and all(each.size != self._size for each in self.held)
-        goes_on = last is not None and seen.era == last.era and bool(self._taken)
+        goes_on = last is not None and seen.count_restarts == last.count_restarts and bool(self._taken)
         if goes_on and last is not None and seen.number <= last.number + max(self._step, 1):
-            return False
+            block = self._taken[self._now]  # a number between those of the step waits for others, which may be, too
+            return patience > 1 and self._step > 1 and bool((seen.number - block.first) % block.step)
         return patience > 1 or (patience == 1 and goes_on and self._step == 0 and len(self.held) < 2)
 
     def _decide(self, seen: Seen, patience: int) -> Decision:
@@ -287,11 +299,11 @@ class Sorter:
         if self._size not in (None, seen.size):
             is_alone = not patience or any(each.size == self._size for each in self.held)
             return Unknown("it has another size than the others", fits=False) if is_alone else NewEpoch("")
-        is_anew = last is not None and seen.era != last.era
+        is_anew = last is not None and seen.count_restarts != last.count_restarts
         if last is not None and block is not None:
             if (is_anew or self._is_another_count(seen, last)) and (why := self._new_epoch(seen, last, block)):
                 return NewEpoch(why)
-            if not (is_anew or self._step):
+            if not is_anew and (not self._step or self._is_step_wrong(seen, last, block)):
                 self._learn_step(seen, last, block)
         place = self._place(seen, block, is_anew)
         self._size, self._last = seen.size, seen
@@ -300,22 +312,23 @@ class Sorter:
             return place
         self._known, views = self._known if seen.phase == NOT_TOLD else seen, self._views
         if views is not None and not (isinstance(place, Place) and self._taken[place.block] is views):
-            views.away = views.away or seen
+            views.first_frame_of_other_kind = views.first_frame_of_other_kind or seen
         if isinstance(place, Place):
             place, self._note = replace(place, note=self._note), ""
         return place
 
     def _is_another_count(self, seen: Seen, last: Seen) -> bool:
         """Whether a number that rose while the server had gone rose by far more or less than the time did."""
-        if not seen.reconnected or seen.era != self._recent[0].era or last.number == self._recent[0].number:
+        oldest = self._recent[0]
+        if not seen.reconnected or seen.count_restarts != oldest.count_restarts or last.number == oldest.number:
             return False
-        period = (last.time - self._recent[0].time) / (last.number - self._recent[0].number)
+        period = (last.time - oldest.time) / (last.number - oldest.number)
         expected = (seen.number - last.number) * period
         return not expected / 2 <= seen.time - last.time <= 2 * expected + 2 * period
 
     def _new_epoch(self, seen: Seen, last: Seen, block: _Taken) -> str:
         """Why the file ends, where numbers have begun anew; "": another block begins, or none."""
-        if seen.number == last.number and not (seen.reconnected or block.is_over):
+        if (seen.number, seen.phase) == (last.number, last.phase) and not (seen.reconnected or block.is_over):
             raise DataError(f"{not_set(seen.number)}. What came before is in the file.")
         is_same = seen.phase in (BY_ORDER, NOT_TOLD) or (
             seen.phase.kind is block.kind and (block.kind is VIEW or seen.phase.serial == self._serial)
@@ -330,18 +343,35 @@ class Sorter:
     def _learn_step(self, seen: Seen, last: Seen, block: _Taken) -> None:
         """By how much numbers rise from frame to frame: by more than 1 where all of some do, and none was lost."""
         following = [last, seen, *self.held]
-        rises = [b.number - a.number for a, b in pairwise(following) if a.era == b.era]
+        rises = [b.number - a.number for a, b in pairwise(following) if a.count_restarts == b.count_restarts]
         step = math.gcd(*rises)
         if len(rises) < 2 and step > 1:
             return
         lost = self._witness is not None and self._witness.were_lost(last.time, following[-1].time, len(rises))
-        self._step = block.step = 1 if lost else step
-        if self._step > 1:
+        step = 1 if lost else step
+        if self._step:
             self._note = (
-                f"The numbers of frames rise by {step}: a plugin averages {step} frames, or passes on each {step}th. "
+                f"Numbers rise by {step} from frame {seen.number} on, not by {block.step}: frames before it were lost, "
+                f"and what was stored up to frame {last.number} may have a wrong kind or angle. Leave it out."
+            )
+            numbers = [block.first + block.step * trigger for trigger in block.triggers]
+            if seen.phase == BY_ORDER:
+                same = [i for i, each in self._taken.items() if each.count_restarts == block.count_restarts]
+                block.first -= (block.step - step) * sum(self._planned[i].n for i in same if i < self._now)
+            block.triggers = {i for number in numbers if (i := (number - block.first) // step) < block.n}
+        elif step > 1:
+            self._note = (
+                f"The numbers of frames rise by {step}: a plugin averages {step} frames, or passes on one in {step}. "
                 "Each that comes is taken for a frame of the plan. If the plan counts the camera's frames, take the "
                 "image before that plugin (NDArrayPort)."
             )
+        self._step = block.step = step
+
+    def _is_step_wrong(self, seen: Seen, last: Seen, block: _Taken) -> bool:
+        """Whether more numbers of the same acquisition than one are between those of the step."""
+        now = (last.count_restarts, last.phase)
+        ahead = [each for each in (seen, *self.held) if (each.count_restarts, each.phase) == now]
+        return sum((each.number - block.first) % block.step > 0 for each in ahead) > 1
 
     def _place(self, seen: Seen, block: _Taken | None, is_anew: bool) -> Decision:
         """Where a frame belongs that begins no file."""
@@ -354,15 +384,15 @@ class Sorter:
         elif kind is None:
             return self._outside(seen, block)
         elif kind is VIEW and views is not None:
-            if not views.is_over and views.away is not None:
-                self._go_on(seen, views, views.away)
+            if not views.is_over and views.first_frame_of_other_kind is not None:
+                self._go_on(seen, views, views.first_frame_of_other_kind)
         elif block is None or kind is not block.kind or seen.phase.serial != self._serial:
             self._begin(seen, kind, is_anew)
         block = self._taken.get(self._now)
         if block is None or kind not in (None, block.kind) or seen.number < block.first:
             return Outside()
         trigger, rest = divmod(seen.number - block.first, block.step)
-        if block.closed or seen.era != block.era or trigger >= block.n:
+        if block.closed or seen.count_restarts != block.count_restarts or trigger >= block.n:
             return self._outside(seen, block)
         if rest:
             return Unknown(f"numbers rise by {block.step}, and its own is none of them")
@@ -377,7 +407,8 @@ class Sorter:
         if block is None or block.closed or seen.number < block.end:
             return Outside()
         block.closed = True
-        return Outside(lost=range(block.last + block.step, block.end if seen.era == block.era else 0, block.step))
+        end = block.end if seen.count_restarts == block.count_restarts else 0
+        return Outside(lost=range(block.last + block.step, end, block.step))
 
     def _by_order(self, seen: Seen, block: _Taken | None, is_anew: bool) -> None:
         """Open the planned block that follows from the order of blocks and their counts."""
@@ -388,7 +419,8 @@ class Sorter:
             i, first, basis = 0, self._first_id - n_before_views(self._planned) * step, Basis.GIVEN
         else:
             i += 1
-            lost, basis = self._lost_before(seen, is_anew, self._planned[i].n if i < len(self._planned) else 0)
+            begun = self._planned[i] if i < len(self._planned) else PlannedBlock(VIEW, 0)
+            lost, basis = self._lost_before(seen, is_anew, begun)
             first = seen.number - lost * step
         while i < len(self._planned) and seen.number >= first:
             if i != self._now:
@@ -399,20 +431,16 @@ class Sorter:
         """Open the block that begins with a frame of another kind, or with other darks or flats."""
         views, lost, basis = self._views, 0, Basis.WAITED
         if views is not None and not views.is_over:  # within the projections, or at their end, some of which are lost
-            n_left = views.n - 1 - views.trigger(views.last)
-            views.closed = seen.number >= views.end if seen.era == views.era else n_left <= WINDOW
+            is_same_count = seen.count_restarts == views.count_restarts
+            views.closed = seen.number >= views.end if is_same_count else views.n_left <= WINDOW
         is_later = views is None or views.is_over
-        kinds = [each.kind for each in self._planned]
-        free = [
-            i
-            for i, each in enumerate(kinds)
-            if each is kind and i not in self._taken and (is_later or VIEW in kinds[i:])
-        ]
-        n = next((each.n for each in self._planned if each.kind is kind), UNPLANNED)
+        planned = [(i, each) for i, each in enumerate(self._planned) if each.kind is kind]
+        free = [i for i, _ in planned if i not in self._taken and (is_later or VIEW in self._kinds(i))]
+        n = planned[0][1].n if planned and (free or is_later) else UNPLANNED
         if kind is VIEW and self._first_id is not None:
             lost, basis = (seen.number - self._first_id) // (self._step or 1), Basis.GIVEN
         elif kind is VIEW:
-            lost, basis = self._lost_before(seen, is_anew, n)
+            lost, basis = self._lost_before(seen, is_anew, PlannedBlock(VIEW, n))
         if lost >= 0:
             i = free[0] if free else max(len(self._planned) - 1, *self._taken, -1) + 1
             self._open(i, PlannedBlock(kind, n), seen.number - lost * (self._step or 1), seen, basis)
@@ -422,14 +450,14 @@ class Sorter:
         if (before := self._taken.get(self._now)) is not None and i < len(self._planned):
             before.closed = True
         self._now, self._serial = i, seen.phase.serial
-        self._taken[i] = _Taken(block.kind, block.n, first, step, first - step, seen.era, basis)
+        self._taken[i] = _Taken(block.kind, block.n, first, step, first - step, seen.count_restarts, basis)
 
-    def _lost_before(self, seen: Seen, is_anew: bool, n: int) -> tuple[int, Basis]:
-        """Frames of a block of n that were lost before the first that came, and what tells it."""
-        known, step = self._known, self._step or 1
-        second = next((each for each in self.held if each.era == seen.era), None)
+    def _lost_before(self, seen: Seen, is_anew: bool, block: PlannedBlock) -> tuple[int, Basis]:
+        """Frames of a block that were lost before the first that came, and what tells it."""
+        known, step, n, noun = self._known, self._step or 1, block.n, block.kind.name.lower()
+        second = next((each for each in self.held if each.count_restarts == seen.count_restarts), None)
         gap, is_other = n, known is not None and known.phase != BY_ORDER and known.phase.kind is not seen.phase.kind
-        if known is not None and is_other and known.era == seen.era and not seen.reconnected:
+        if known is not None and is_other and known.count_restarts == seen.count_restarts and not seen.reconnected:
             gap = (seen.number - known.number) // step - 1  # from n on it is another count
         if gap == 0:
             return 0, Basis.NUMBERS
@@ -437,50 +465,54 @@ class Sorter:
             counted = self._witness.counted(seen.time, None if second is None else second.time)
             lost = -1 if counted is None else counted // step - 1
             if 0 <= lost < n and lost <= gap:
-                words = "1 projection" if lost == 1 else f"{lost} projections"
+                words = count(lost, noun)
                 self._note = f"The camera had counted {words} before the first that came." if lost else self._note
                 return lost, Basis.COUNTER
-        block = self._taken.get(self._now)
-        if gap < n and known is not None and block is not None and known.number == block.last == block.end - step:
-            before_views = self._planned[self._now + 1 : [each.kind for each in self._planned].index(VIEW)]
-            lost = gap - sum(each.n for each in before_views)
-            if 0 <= lost < n:
-                self._note = f"Frames just before {seen.number} were lost: {lost} are taken for the first projections."
-                return lost, Basis.WHOLE
-        is_late = self._joined or seen.reconnected or gap < n or (is_anew and seen.number > 1)
+        is_said = seen.phase == BY_ORDER and bool(self._taken)  # of the file's first block, from which others follow
+        is_late = (self._began_within_scan and not is_said) or seen.reconnected
+        is_late = is_late or gap < n or (is_anew and seen.number > 1)
         if not (is_late or is_anew or is_other) and known is not None and second is not None:
             is_late = seen.time - known.time <= _RUNNING * (second.time - seen.time)
         if is_late:
+            off = "" if block.kind is VIEW else "the kinds of frames and "
             self._note = (
-                f"Nothing tells whether frame {seen.number} is the first projection of the scan, as frames came before "
-                "it, or may have. It is taken for the first. If others were before it, all angles are off by as many "
-                "steps. ride.camera or ride.first_id tells it."
+                f"Nothing tells whether frame {seen.number} is the first {noun} of the scan, as frames came before it, "
+                f"or may have. It is taken for the first. If others were before it, {off}all angles are off by as many "
+                f"steps. {'ride.camera' if block.kind is VIEW else 'ride.kinds'} or ride.first_id tells it."
             )
         return 0, Basis.UNKNOWN if is_late else Basis.WAITED
 
-    def _go_on(self, seen: Seen, views: _Taken, away: Seen) -> None:
+    def _go_on(self, seen: Seen, views: _Taken, other: Seen) -> None:
         """The projections go on after frames of another kind, which are none of their triggers."""
         lost, known = 0, self._known
-        if known is not None and seen.era == known.era == away.era == views.era:
-            lost = views.trigger(away.number) - views.trigger(views.last) - 1
+        counts = {each.count_restarts for each in (seen, known, other, views) if each is not None}
+        if known is not None and len(counts) == 1:
+            lost = views.trigger(other.number) - views.trigger(views.last) - 1
             lost += (seen.number - known.number) // views.step - 1
         trigger = views.trigger(views.last) + 1 + lost
         self._note = f"Other frames came within the projections, which go on with {trigger} at number {seen.number}" + (
             f", as {lost} were lost before and after those." if lost else "."
         )
-        views.first, views.era, views.away = seen.number - trigger * views.step, seen.era, None
+        views.first, views.count_restarts = seen.number - trigger * views.step, seen.count_restarts
+        views.first_frame_of_other_kind = None
         views.last = seen.number - (lost + 1) * views.step
         self._now = next(i for i, each in self._taken.items() if each is views)
 
-    def _unwrapped(self, raw: int, *, is_anew: bool = False) -> int:
-        """A number that goes on where a counter of 16 or 32 bits has begun again at its end."""
+    def _unwrapped(self, raw: int, time: float = math.nan, *, is_anew: bool = False) -> int:
+        """A number that goes on where a counter of 16 or 32 bits has begun again at its end. A longer time than before
+        says that 0 may be lost."""
         last, self._raw = raw if self._raw is None else self._raw, raw
         for low, top in _RANGES:
             if top - _NEAR <= last <= top and low <= raw <= low + _NEAR and not is_anew:
                 self._last_wrap = top - low + (low != 0 or raw == 0)  # cameras of GigE Vision leave out 0
                 self._wrapped += self._last_wrap
-                if last < top or raw > low + 1:
-                    self._note = f"Numbers went from {last} to {raw}: as if the counter had gone on beyond {top}."
+                times = [each.time for each in (*self._recent, *self.held)]
+                is_long = len(times) > 2 and time - times[-1] > 1.5 * float(np.median(np.diff(times)))
+                if last < top or raw > low + 1 or (raw != low and is_long):
+                    left_out = "" if self._last_wrap > top - low else f", and {low} is taken for left out"
+                    self._note = (
+                        f"Numbers went from {last} to {raw}: as if the counter had gone on beyond {top}{left_out}."
+                    )
             elif self._last_wrap and top - _NEAR <= raw <= top and low <= last <= low + _NEAR:
                 self._raw = last  # exchanged with its neighbour
                 return raw + self._wrapped - self._last_wrap
@@ -515,11 +547,37 @@ class Sorter:
         begun = all(i in self._taken for i in range(len(self._planned)))
         return begun and self._taken[self._now].is_over and (self._views is None or self._views.is_over)
 
+    @property
+    def is_by_order(self) -> bool:
+        """Whether the kinds of frames follow from the order of the plan's blocks."""
+        return self._serial == BY_ORDER.serial
+
+    def _kinds(self, first: int) -> list[FrameKind]:
+        """Of the planned blocks from the first one on."""
+        return [each.kind for each in self._planned[first:]]
+
+    @property
+    def n_left(self) -> int:
+        """Frames that may yet come at the end of what is counted from the first projection: of the projections or,
+        where kinds go by order, of the whole plan."""
+        views, n = self._views, 0
+        if views is None:
+            return 0
+        after = range(len(self._planned) - 1, self._kinds(0).index(VIEW), -1) if self.is_by_order else ()
+        for i in after:
+            block = self._taken.get(i)
+            if block is not None and block.count_restarts == views.count_restarts:
+                return n + block.n_left
+            n += self._planned[i].n if block is None else 0
+        return n + views.n_left
+
     def is_over(self, block: int) -> bool:
         """Whether no more frames of a block are expected."""
         return self._taken[block].is_over
 
     def missing(self, block: int) -> list[int]:
         """Triggers of a planned block that gave no frame."""
-        came = self._taken[block].triggers if block in self._taken else set[int]()
-        return [trigger for trigger in range(self._planned[block].n) if trigger not in came]
+        planned, taken, now = self._planned[block], self._taken.get(block), self._taken.get(self._now)
+        if taken is None and now is not None and now.kind is planned.kind and self._now >= len(self._planned):
+            taken = now  # extra ones at the end stand for those that are planned there
+        return [trigger for trigger in range(planned.n) if taken is None or trigger not in taken.triggers]

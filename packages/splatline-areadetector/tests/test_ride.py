@@ -112,7 +112,7 @@ def test_a_first_projection_that_is_lost_shows_at_the_end_and_it_is_said_that_it
         told = ride_along(config_of(tmp_path, ioc.url, angles, first_id=first_id), tmp_path, scan)
     (file,) = stored(tmp_path)
     assert isinstance(told.error, LedgerError) and file.missing == ([7] if first_id is None else [0])
-    undecided = "it may be the first 1 that are missing: then all angles are 0.5° more, by which the volume is turned"
+    undecided = "it may be the first that is missing: then all angles are 0.5° more, by which the volume is turned"
     assert (undecided in str(told.error)) is (first_id is None)
 
 

@@ -92,7 +92,7 @@ def test_a_camera_that_ran_free_before_the_projections(tmp_path: Path, pause: fl
     said = f"{told.error}{told.warnings}"
     if lost and not pause:
         assert file.ids.tolist() == [*range(32, 91)] and "Nothing tells whether frame 32 is the first" in said
-        assert "it may be the first 1 that are missing" in said
+        assert "it may be the first that is missing" in said
     else:
         assert np.allclose(file.degrees, 3.0 * (file.ids - 31)) and file.missing == [*range(lost)]
         assert (told.error is None) is (lost == 0) and "Nothing tells" not in said
@@ -126,6 +126,17 @@ def test_neighbours_that_are_exchanged_are_stored_in_one_file(tmp_path: Path) ->
     told, (file,) = _ridden(tmp_path, rows, **KINDS)
     assert told.error is None and not told.warnings and not _wrong(file)
     assert file.kinds.tolist() == [2] * 5 + [1] * 5 + [0] * 20 + [1] * 5 and _views(file) == [*range(20)]
+
+
+def test_a_first_dark_that_was_lost_shifts_kinds_by_order_which_is_said(tmp_path: Path) -> None:
+    """The ride waits for the last frame of the plan until a stop, long after the last that came."""
+    rows = [(k, i, n, {}) for k, i, n, _ in SCAN[1:]]
+    told, (file,) = _ridden(tmp_path, rows, stop_after=2.0, **{**KINDS, "kinds": None})
+    assert file.kinds.tolist() == [2] * 5 + [1] * 5 + [0] * 20 + [1] * 4 and len(_wrong(file)) == 20
+    assert "1 of 5 flats is missing: 4. As nothing tells the number of the first one, it may be the first that is " in (
+        said := str(told.error)
+    )
+    assert "frames next to those of another kind have the wrong kind, and all angles are 9° more. ride.kinds" in said
 
 
 def _renumbered(numbers: Iterable[int], words: bool = True) -> list[Any]:

@@ -76,7 +76,7 @@ def test_frames_that_cannot_be_decoded_are_told_once(tmp_path: Path, whole: int)
         assert [file.ids.tolist() for file in stored(tmp_path)] == [[*range(1, whole + 1)]]
     assert isinstance(told.error, LedgerError)
     lost = f"{20 - whole} of 20 projections are missing"
-    assert lost in str(told.error) and f"{20 - whole} frames came ({whole + 1}-20) that did not count: " in str(
+    assert lost in str(told.error) and f"{20 - whole} frames came ({whole + 1}-20) but could not be used: " in str(
         told.error
     )
     assert told.warnings.count("cannot be decoded") == 1
@@ -96,8 +96,8 @@ def test_an_attribute_that_one_frame_lacks_costs_that_frame_alone(tmp_path: Path
     with FakeIoc() as ioc:
         told = ride_along(config_of(tmp_path, ioc.url, {"from": "attribute", "views": 20}), tmp_path, scan)
     (file,) = stored(tmp_path)
-    assert isinstance(told.error, LedgerError) and "1 of 20 projections are missing: 6" in str(told.error)
-    assert "1 frame came (7) that did not count: nothing tells its angle" in str(told.error)
+    assert isinstance(told.error, LedgerError) and "1 of 20 projections is missing: 6" in str(told.error)
+    assert "1 frame came (7) but could not be used: nothing tells its angle" in str(told.error)
     assert file.kinds.tolist() == [0] * 6 + [3] + [0] * 13 and len(file.ids) == 20
     assert np.allclose(np.delete(file.degrees, 6), np.delete(9.0 * np.arange(20), 6))
 
@@ -115,7 +115,7 @@ def test_a_pandaboxs_file_with_fewer_rows_than_views(tmp_path: Path) -> None:
         told = ride_along(config_of(tmp_path, ioc.url, angles), tmp_path, lambda stop: ioc.send(range(1, 21)))
     assert "panda.h5 has 12 rows, 0° to 99°, which are this scan's unless it is written anew." in " ".join(told.before)
     assert isinstance(told.error, LedgerError) and "8 of 20 projections are missing: 12-19" in str(told.error)
-    assert "8 frames came (13-20) that did not count: nothing tells its angle" in str(told.error)
+    assert "8 frames came (13-20) but could not be used: nothing tells its angle" in str(told.error)
     assert "Now: " in str(told.error) and "panda.h5 has 12 rows" in str(told.error)
     assert told.warnings.count("nothing tells its angle") == 1
     (file,) = stored(tmp_path)

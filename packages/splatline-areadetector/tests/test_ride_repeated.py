@@ -26,7 +26,7 @@ WAITING = "Waiting for the first frame"
     [
         ([range(1, 21), range(21, 41)], False, 0, "Recorded: 2 scans, of which 0 lack frames."),
         ([range(1, 21), [*range(21, 31), *range(32, 41)], range(41, 61)], False, 5,
-         "Recorded: 3 scans, of which 1 lacks frames. The last such: 1 of 20 projections are missing: 10"),
+         "Recorded: 3 scans, of which 1 lacks frames. The last such: 1 of 20 projections is missing: 10"),
         ([range(1, 21)], True, 4, "Recorded: 1 scan before this one, of which 0 lack frames."),
     ],
 )  # fmt: skip
@@ -43,11 +43,25 @@ def test_scan_after_scan_until_ctrl_c(
         ride.process.send_signal(signal.SIGINT)
         assert ride.exit_code(60) == code, ride.output
         assert sentence in " ".join(ride.output.split())
+        assert len(re.findall("^file ", ride.output, re.MULTILINE)) == sum(len(ids) == 20 for ids in scans)
     files = stored(tmp_path)
     assert [file.ids.tolist() for file in files[: len(scans)]] == [[*ids] for ids in scans]
     assert [file.status for file in files[: len(scans)]] == [
         "complete" if len(ids) == 20 else "failed" for ids in scans
     ]
+
+
+def test_a_scan_that_follows_at_once_keeps_its_first_frames(tmp_path: Path) -> None:
+    """The last projection but one was lost, so that the last one waited while the next scan began."""
+    with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", angles=PLAN) as ride:
+        for ids in (range(1, 19), range(20, 41)):
+            ioc.send(ids)
+        ride.wait_for(lambda: ride.output.count(WAITING) >= 3)
+        ride.process.send_signal(signal.SIGINT)
+        assert ride.exit_code(60) == 5, ride.output
+    one, other = stored(tmp_path)
+    assert one.missing == [18] and one.ids.tolist() == [*range(1, 19), 20]
+    assert other.ids.tolist() == [*range(21, 41)] and other.degrees.tolist() == [9.0 * i for i in range(20)]
 
 
 def test_ctrl_c_before_any_scan_says_that_nothing_was_recorded(tmp_path: Path) -> None:

@@ -178,7 +178,8 @@ def test_the_first_projection_by_its_number() -> None:
         (seen(range(1, 31), NO_SCAN), None, range(32, 91), 32, Basis.UNKNOWN),
         (seen(range(1, 31), NO_SCAN), 5, range(32, 91), 32, Basis.UNKNOWN),  # more than numbers that are lost
         (seen(range(1, 6), FLATS), None, range(6, 66), 6, Basis.NUMBERS),
-        (seen(range(1, 6), FLATS), None, range(7, 66), 6, Basis.WHOLE),
+        (seen(range(1, 6), FLATS), None, range(7, 66), 7, Basis.UNKNOWN),  # of no scan, or a projection
+        (seen(range(1, 6), FLATS), None, range(12, 72), 12, Basis.UNKNOWN),  # the camera counted without delivering
         (seen(range(1, 5), FLATS), None, range(7, 66), 7, Basis.UNKNOWN),  # a flat, or a projection
         (seen(range(1, 6), FLATS), None, range(65500, 65560), 65500, Basis.WAITED),  # another count
         ([], None, range(7, 60), 7, Basis.WAITED),
@@ -198,13 +199,13 @@ def test_what_the_first_projection_rests_on(
 def test_a_ride_that_came_late_says_so() -> None:
     """Frames were coming when it subscribed, or its server restarted within the scan."""
     times = [Seen(i, BY_ORDER, time=float(i)) for i in range(15, 35)]
-    for before, joined, late in (
+    for before, began_within_scan, late in (
         (Seen(14, BY_ORDER, time=14.0), False, True),
         (Seen(14, BY_ORDER, time=2.0), False, False),
         (None, False, False),
         (None, True, True),
     ):
-        sorter = Sorter([PlannedBlock(VIEW, 20)], before=before, joined=joined)
+        sorter = Sorter([PlannedBlock(VIEW, 20)], before=before, began_within_scan=began_within_scan)
         decided = sort(sorter, times)
         assert triggers(decided) == {i: i - 15 for i in range(15, 35)}
         assert ("Nothing tells whether frame 15 is the first" in notes(decided)) is late
@@ -274,6 +275,82 @@ def test_a_plugin_that_averages_is_said_and_each_frame_is_a_projection() -> None
         assert triggers(decided) == {i: i - 1 for i in numbers}
 
 
+def test_a_step_learned_from_frames_of_which_every_second_was_lost_is_revised() -> None:
+    decided = sort(Sorter([PlannedBlock(VIEW, 20)]), seen([*range(1, 12, 2), *range(12, 21)], VIEWS))
+    assert triggers(decided) | {i: (i - 1) // 2 for i in range(1, 12, 2)} == triggers(decided)  # stored before
+    assert all(triggers(decided)[i] == i - 1 for i in range(12, 21))
+    assert "rise by 1 from frame 12 on, not by 2" in notes(decided) and "up to frame 11 may have a wrong" in notes(
+        decided
+    )
+    sorter = Sorter([PlannedBlock(FLAT, 4), PlannedBlock(VIEW, 20)])
+    decided = sort(sorter, seen([*range(1, 12, 2), *range(12, 25)], BY_ORDER))
+    assert {i: i - 5 for i in range(12, 25)}.items() <= triggers(decided).items() and sorter.complete
+
+
+def test_a_count_that_goes_on_between_acquisitions_by_no_multiple_of_the_step_revises_nothing() -> None:
+    decided = sort(Sorter([PlannedBlock(FLAT, 8), PlannedBlock(VIEW, 6)]), [
+        *seen(range(5, 45, 5), FLATS), *seen(range(53, 83, 5), VIEWS)
+    ])  # fmt: skip
+    assert triggers(decided, FLAT) == {5 * i + 5: i for i in range(8)}
+    assert triggers(decided) == {53 + 5 * i: i for i in range(6)} and "not by 5" not in notes(decided)
+
+
+def test_first_frames_that_were_lost_where_kinds_go_by_order() -> None:
+    """All kinds and angles may be shifted: frames are missing at the end of the whole plan."""
+    blocks = [PlannedBlock(DARK, 3), PlannedBlock(FLAT, 3), PlannedBlock(VIEW, 8), PlannedBlock(FLAT, 3)]
+    for first, last, left in ((2, 17, 1), (1, 17, 0), (1, 14, 3), (1, 12, 5), (1, 6, 0)):
+        sorter = Sorter(blocks)
+        sort(sorter, seen(range(first, last + 1), BY_ORDER))
+        assert sorter.is_by_order and sorter.n_left == left
+    sorter = Sorter(blocks)
+    sort(sorter, [*seen(range(1, 4), DARKS), *seen(range(4, 7), FLATS), *seen(range(7, 14), VIEWS)])
+    assert not sorter.is_by_order and sorter.n_left == 1
+
+
+def test_a_block_of_which_one_frame_came_before_numbers_begin_anew() -> None:
+    frames = [Seen(1, DARKS), *seen((1, 2, 3, 4, 5), VIEWS), *seen((1, 2, 3), FLATS)]
+    sorter = Sorter(BLOCKS)
+    assert triggers(sort(sorter, frames)) == {i: i - 1 for i in range(1, 6)} and sorter.missing(0) == [1]
+
+
+def test_a_number_of_the_next_acquisition_fills_no_gap_of_the_one_before() -> None:
+    sorter = Sorter([PlannedBlock(DARK, 6), PlannedBlock(VIEW, 8)])
+    decided = sort(sorter, [*seen((1, 3, 4, 5, 6), DARKS), *seen(range(2, 9), VIEWS)])
+    assert sorter.missing(0) == [1] and list(triggers(decided)) == [*range(2, 9)]
+    assert not sorter.basis.is_sure and "Nothing tells whether frame 2 is the first projection" in notes(decided)
+
+
+def test_the_kind_of_the_first_frame_of_a_second_file_is_assumed_by_order() -> None:
+    sorter = Sorter(BLOCKS, before=Seen(1, BY_ORDER), began_within_scan=True)
+    told = notes(sort(sorter, [*seen(range(1, 3), BY_ORDER), *seen(range(1, 6), BY_ORDER)]))
+    assert "whether frame 1 is the first dark of the scan" in told and "the kinds of frames and all angles" in told
+    assert told.count("Nothing tells") == 1
+    sorter = Sorter(BLOCKS, before=Seen(9, VIEWS), began_within_scan=True)  # a second file that begins with darks
+    told = notes(sort(sorter, [*seen((1, 2), DARKS), *seen(range(1, 6), VIEWS)]))
+    assert "whether frame 1 is the first projection" in told
+
+
+def test_more_flats_within_the_projections_than_planned_are_stored() -> None:
+    frames = [*seen(range(1, 4), FLATS), *seen(range(4, 8), VIEWS), *seen(range(8, 14), FLATS)]
+    sorter = Sorter([PlannedBlock(FLAT, 3), PlannedBlock(VIEW, 8)])
+    decided = sort(sorter, [*frames, *seen(range(14, 18), VIEWS)])
+    assert len(triggers(decided, FLAT)) == 9 and [*triggers(decided).values()] == [*range(8)] and sorter.complete
+
+
+def test_flats_at_the_end_that_number_anew_after_lost_projections_are_those_planned() -> None:
+    sorter = Sorter([PlannedBlock(VIEW, 20), PlannedBlock(FLAT, 3)])
+    decided = sort(sorter, [*seen(range(1, 16), VIEWS), *seen((1, 2), FLATS)])
+    assert len(triggers(decided, FLAT)) == 2 and sorter.missing(1) == [2] and sorter.missing(0) == [*range(15, 20)]
+
+
+def test_a_0_that_was_lost_where_a_counter_begins_again_is_said() -> None:
+    numbers = [*range(65530, 65536), *range(1, 6)]
+    for lost in (False, True):
+        frames = [Seen(number, VIEWS, time=i + (lost and number < 9)) for i, number in enumerate(numbers)]
+        told = notes(sort(Sorter([PlannedBlock(VIEW, 20)]), frames))
+        assert ("from 65535 to 1" in told and "0 is taken for left out" in told) is lost and bool(told) is lost
+
+
 def test_a_number_that_stays_the_same_is_not_set() -> None:
     with pytest.raises(DataError, match="uniqueId is not set: it stays at 0 while the pixels change"):
         sort(Sorter(BLOCKS[1:2]), seen([0] * 9, VIEWS))
@@ -284,9 +361,10 @@ def test_a_kind_that_is_not_told_for_some_frames() -> None:
     sorter = Sorter(BLOCKS)
     decided = sort(sorter, [Seen(i, phase) for i, phase in enumerate(phases, 1)])
     assert triggers(decided) == {i: i - 3 for i in range(3, 8)} and not notes(decided)
-    phases = [*[DARKS] * 2, NOT_TOLD, *[VIEWS] * 4]  # the first projection: a dark, or nothing, for all that is known
+    phases = [*[DARKS] * 2, NOT_TOLD, *[VIEWS] * 4]  # the first projection, or of no scan, for all that is known
     decided = sort(Sorter(BLOCKS), [Seen(i, phase) for i, phase in enumerate(phases, 1)])
-    assert triggers(decided) == {i: i - 3 for i in range(4, 8)} and isinstance(decided[2][1], Unknown)
+    assert triggers(decided) == {i: i - 4 for i in range(4, 8)} and isinstance(decided[2][1], Unknown)
+    assert "Nothing tells whether frame 4 is the first projection" in notes(decided)
 
 
 def test_frames_of_another_size() -> None:
