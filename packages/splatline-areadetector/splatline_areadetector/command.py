@@ -13,7 +13,7 @@ import click
 from beamline.cli.options import json_events, json_option, set_option
 from beamline.cli.terminal import PageBeside, Terminal
 from beamline.core.errors import AlarmError, BeamlineError
-from beamline.core.events import RunStarted
+from beamline.core.events import Event, RunStarted
 from beamline.core.run_result import RunResult
 from beamline.core.stop import StopRequest, stop_signals
 from beamline.core.text import count
@@ -113,7 +113,12 @@ def _ride(
         if page:  # of all its scans, at one address
             runs.mkdir(parents=True, exist_ok=True)
             tell = held.enter_context(PageBeside(terminal.say)).serve("runs", str(runs), "--page")
-            sinks.append(lambda event: tell(f"{event.folder}\n".encode()) if isinstance(event, RunStarted) else None)
+
+            def tell_of(event: Event) -> None:
+                if isinstance(event, RunStarted):
+                    tell(f"{event.folder}\n".encode())
+
+            sinks.append(tell_of)
         live = None
         if config.recon.live and not no_live:
             live = Standby()

@@ -215,7 +215,7 @@ def test_rows_that_are_no_position_and_rows_that_do_not_come_are_no_angle(tmp_pa
 
 
 def test_a_file_is_read_anew_for_each_scan_and_rows_beyond_its_views_are_left(tmp_path: Path) -> None:
-    path, guides = tmp_path / "panda.h5", []
+    path, guides = tmp_path / "panda.h5", list[Any]()
     assert _panda(tmp_path).status.endswith("panda.h5 is not there yet")
     for start in (0.0, 5.0):
         with h5py.File(path, "w") as file:

@@ -13,13 +13,17 @@ import pytest
 from fake_ioc import TOMOSCAN, FakeIoc, array_value, counts_of
 from ridden import Stored, Told, config_of, ride_along, stored
 
-from beamline.core.errors import ConfigError
-from beamline.core.stop import ScanStopped, StopRequest
+from beamline.core.errors import ConfigError, ScanStopped
+from beamline.core.stop import StopRequest
 from beamline.scan.ledger import LedgerError
 
 pytestmark = pytest.mark.usefixtures("loopback")
 WORDS = {0: "data", 1: "data_white", 2: "data_dark"}
-KINDS = {"kinds": "HDF5FrameLocation", "darks": {"count": 5, "at": "start"}, "flats": {"count": 5, "at": "both"}}
+KINDS: dict[str, Any] = {
+    "kinds": "HDF5FrameLocation",
+    "darks": {"count": 5, "at": "start"},
+    "flats": {"count": 5, "at": "both"},
+}
 
 
 def _pixels(kind: int, i: int) -> Any:
@@ -130,7 +134,7 @@ def test_neighbours_that_are_exchanged_are_stored_in_one_file(tmp_path: Path) ->
 
 def test_a_first_dark_that_was_lost_shifts_kinds_by_order_which_is_said(tmp_path: Path) -> None:
     """The ride waits for the last frame of the plan until a stop, long after the last that came."""
-    rows = [(k, i, n, {}) for k, i, n, _ in SCAN[1:]]
+    rows: list[Any] = [(k, i, n, {}) for k, i, n, _ in SCAN[1:]]
     told, (file,) = _ridden(tmp_path, rows, stop_after=2.0, **{**KINDS, "kinds": None})
     assert file.kinds.tolist() == [2] * 5 + [1] * 5 + [0] * 20 + [1] * 4 and len(_wrong(file)) == 20
     assert "1 of 5 flats is missing: 4. As nothing tells the number of the first one, it may be the first that is " in (

@@ -17,7 +17,7 @@ from beamline.core.stop import StopRequest
 from beamline.scan.ledger import LedgerError
 
 pytestmark = pytest.mark.usefixtures("loopback")
-COMPRESSED = {"codec": {"name": "lz4", "parameters": 6}}
+COMPRESSED: dict[str, Any] = {"codec": {"name": "lz4", "parameters": 6}}
 
 
 def _garbled(unique_id: int) -> Any:

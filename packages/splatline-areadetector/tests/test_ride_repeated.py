@@ -35,7 +35,7 @@ def test_scan_after_scan_until_ctrl_c(
 ) -> None:
     with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, "--no-live", "--repeat", angles=PLAN) as ride:
         for n, ids in enumerate(scans, 2):
-            ioc.send(ids)  # type: ignore[arg-type]
+            ioc.send(ids)
             ride.wait_for(lambda n=n: ride.output.count(WAITING) >= n)  # type: ignore[misc]
         if in_the_midst:
             ioc.send(range(101, 106))

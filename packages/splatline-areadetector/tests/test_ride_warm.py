@@ -36,8 +36,10 @@ def test_the_process_that_has_warmed_up_makes_the_volume(tmp_path: Path, warm: b
     with FakeIoc() as ioc, RideProgram(tmp_path, ioc.url, *given, period_s=1 / FPS, angles=angles) as ride:
         (waiting,) = _children(ride)
         deadline = time.monotonic() + 240
-        while warm and sum(waiting.cpu_times()[:2]) != (time.sleep(10), sum(waiting.cpu_times()[:2]))[1]:
+        before = -1.0
+        while warm and before != (before := sum(waiting.cpu_times()[:2])):
             assert time.monotonic() < deadline
+            time.sleep(10)
         if not warm:
             waiting.kill()
         began = time.monotonic()

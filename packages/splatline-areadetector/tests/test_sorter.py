@@ -450,7 +450,7 @@ SCANS = st.builds(
 def _is_said(sorter: Sorter, decided: list[tuple[Seen, Decision]]) -> bool:
     """Whether the ride says of the angles that they may be others: the file ends, something had to be assumed, or the
     last projections are missing, which may be the first ones."""
-    words = [each for _, each in decided if isinstance(each, NewEpoch | Unknown) or getattr(each, "note", "")]
+    words = [each for _, each in decided if isinstance(each, NewEpoch | Unknown) or bool(getattr(each, "note", ""))]
     return bool(words) or (not sorter.basis.is_sure and 11 in sorter.missing(2))
 
 
