@@ -40,7 +40,9 @@ FOR_PACKAGES = {
     "beamline.core.files": ("parts_of", "refuse_existing", "text_in", "atomic_file", "write_together", "write_whole"),
     "beamline.core.text": ("count", "csv_text", "memory_size", "rounded", "safe_name", "size", "spans"),
     "beamline.core.quantities": ("VoxelKind",),
-    "beamline.core.events": ("BlockDone", "BlockStarted", "Event", "RunStarted", "Sink", "StateEntered", "Warned", "json_of"),
+    "beamline.core.events": (
+        "BlockDone", "BlockStarted", "Event", "RunStarted", "Sink", "StateEntered", "Warned", "json_of",
+    ),
     "beamline.core.machine": ("free_memory",),
     "beamline.core.run_result": ("RunResult",),
     "beamline.core.sinks": ("Note",),
