@@ -80,16 +80,17 @@ class FakeIoc:
     def url(self) -> str:
         return f"pva://{self.prefix}{IMAGE}"
 
-    def put(self, values: Mapping[str, float | str]) -> None:
-        """Set records; of enumerations a value is a label."""
+    def put(self, values: Mapping[str, float | str], seconds: float | None = None) -> None:
+        """Set records; of enumerations a value is a label. `seconds`: the time that they state; None: now."""
+        stamp = time.time() if seconds is None else seconds
         for name, value in values.items():
             labels = _CHOICES.get(name.rpartition(":")[2])
             kind = NTEnum() if labels else NTScalar("s" if isinstance(value, str) else "d")
             wrapped = {"index": labels.index(str(value)), "choices": [*labels]} if labels else value
             if name in self._records:
-                self._records[name].post(wrapped, timestamp=time.time())
+                self._records[name].post(wrapped, timestamp=stamp)
             else:
-                self._records[name] = SharedPV(nt=kind, initial=wrapped, timestamp=time.time())
+                self._records[name] = SharedPV(nt=kind, initial=wrapped, timestamp=stamp)
                 self._provider.add(self.prefix + name, self._records[name])
 
     def post(self, value: Any) -> None:

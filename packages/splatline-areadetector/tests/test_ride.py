@@ -238,13 +238,16 @@ def test_a_lower_number_or_another_size_begins_another_file(tmp_path: Path) -> N
 @pytest.mark.parametrize("lost", [0, 2])
 def test_the_cameras_count_shows_that_the_first_projections_were_lost(tmp_path: Path, lost: int) -> None:
     def scan(stop: StopRequest) -> None:
+        begin = time.time()  # the IOC's times are exact, however late this process sends
+        ioc.put({"cam1:NumImagesCounter_RBV": 0.0}, begin)
         for i in range(20):
             if i >= lost:
-                ioc.send(range(100 + i, 101 + i), 0.01)
-            ioc.put({"cam1:NumImagesCounter_RBV": i + 1.0})  # counts until 0.7 of a period
-            time.sleep(0.09)
+                ioc.post(array_value(counts_of(100 + i), 100 + i, seconds=begin + 0.1 * i))
+            ioc.put({"cam1:NumImagesCounter_RBV": i + 1.0}, begin + 0.1 * i + 0.01)
+            time.sleep(0.1)
 
     with FakeIoc(camera=True) as ioc:
+        ioc.put({"cam1:NumImagesCounter_RBV": 40.0})
         told = ride_along(config_of(tmp_path, ioc.url, camera="pva://T:cam1:"), tmp_path, scan)
     (file,) = stored(tmp_path)
     assert np.allclose(file.degrees, 9.0 * (file.ids - 100)) and file.missing == list(range(lost))
