@@ -15,7 +15,7 @@ with api.connect(config) as instrument:
         # Change the sample here: with a robot, or by hand, with input("Mount it, close the hutch, press Enter ").
         try:
             done.append(instrument.scan(sample=sample))
-        except api.DataError as error:  # frames are missing, or the disk failed; the other samples follow
+        except api.DataError as error:  # missing frames, or a full disk; a device that fails ends the script
             print(f"{sample}: {error}")
             if instrument.last is not None:
                 done.append(instrument.last)

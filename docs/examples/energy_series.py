@@ -12,7 +12,7 @@ from beamline import api
 
 
 def move_monochromator(energy_kev: float) -> None:
-    """Move the monochromator through your control system, such as with `epics.caput(...)`; return when it has stopped."""
+    """Move the monochromator through your control system, e.g. by `epics.caput(...)`; return when it has stopped."""
 
 
 config, *energies = sys.argv[1:]
