@@ -143,7 +143,7 @@ NOT_RUN = {
     "minutes of frames of the whole detector",
     ("docs/first_day.md", "beamline tune my.yaml                         # counts, saturation, transmission, and the "
      "exposure to use"): "an instrument",
-    ("docs/first_day.md", "beamline scan my.yaml --dry-run               # speed, blur, duration, bytes, free disk; "
+    ("docs/first_day.md", "beamline scan my.yaml --dry-run               # speed, blur, duration, size, free disk; "
      "nothing moves"): "an instrument",
     ("docs/first_day.md", "beamline recon runs/NAME/scan.h5 -m fbp --bin 4 -o quick.h5   # is the axis right, is the "
      "sample inside the field of view?"): "the names are the reader's",
