@@ -137,16 +137,16 @@ NOT_RUN = {
     "tests call the same",
     ("packages/splatline-tango/README.md", "from tango import DeviceProxy"): "asks a device of a running server",
     ("docs/first_day.md", "beamline config init --instrument > my.yaml   # every key, with comments"): "an instrument",
-    ("docs/first_day.md", "beamline check my.yaml --connect              # each device connects, and says who it is "
-     "and how it stands; nothing moves"): "an instrument",
+    ("docs/first_day.md", "beamline check my.yaml --connect              # connects to each device, prints its "
+     "identity and its status; nothing moves"): "an instrument",
     ("docs/first_day.md", "beamline scan my.yaml --rehearse --set scan.angles.views=60 --set scan.period_s=0.5"):
     "minutes of frames of the whole detector",
     ("docs/first_day.md", "beamline tune my.yaml                         # counts, saturation, transmission, and the "
-     "exposure to take"): "an instrument",
-    ("docs/first_day.md", "beamline scan my.yaml --dry-run               # speed, blur, duration, bytes, free disk; "
+     "exposure to use"): "an instrument",
+    ("docs/first_day.md", "beamline scan my.yaml --dry-run               # speed, blur, duration, size, free disk; "
      "nothing moves"): "an instrument",
     ("docs/first_day.md", "beamline recon runs/NAME/scan.h5 -m fbp --bin 4 -o quick.h5   # is the axis right, is the "
-     "sample in the field?"): "the names are the reader's",
+     "sample inside the field of view?"): "the names are the reader's",
     ("docs/tutorials.md", "beamline view runs/*_demo-battery/recon.h5"): "a viewer, until Ctrl-C",
     ("docs/tutorials.md", "beamline info SCAN.h5"): "the names are the reader's; README's block runs the same",
     ("docs/tutorials.md", "label,volume_um3,diameter_um,sphericity,z_um,y_um,x_um,cut,contacts,neighbours"): "a table",
