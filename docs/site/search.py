@@ -13,7 +13,8 @@ from mkdocs.exceptions import PluginError
 from mkdocs.plugins import event_priority
 
 GUIDES = ("Start", "Tutorials", "How to")
-"""Groups of the navigation whose pages come first: another page needs a score BOOST times as high to precede a guide."""
+"""Groups of the navigation whose pages come first: another page comes before a guide only with a score over BOOST times
+as high."""
 BOOST = 4.0
 _ADD = "this.add(doc);"
 
