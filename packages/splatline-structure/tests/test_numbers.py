@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse.linalg import cg
 from skimage.measure import marching_cubes, mesh_surface_area, regionprops
 
+from splatline_structure import transport
 from splatline_structure.materials import label_values, labelled, materials_of, probabilities
 from splatline_structure.numbers import Rules, coarse, structure_of
 from splatline_structure.particles import cleaned, measured, parted, surfaces
@@ -83,6 +86,18 @@ def test_the_tortuosity_is_that_of_taufactor(axis: int) -> None:
     solver = taufactor.Solver(np.moveaxis(mask, axis, 0).astype(int), device="cpu")
     solver.solve(verbose=False)
     assert tortuosity(mask, axis) == pytest.approx(float(solver.tau[0]), rel=0.01)
+
+
+def test_few_iterations_solve_the_tortuosity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """29 for this cube; 244 with the diagonal alone, whose number grows with the side."""
+    iterations: list[float] = []
+
+    def counted(*system: Any, **settings: Any) -> Any:
+        return cg(*system, **settings, callback=lambda field: iterations.append(field[0]))
+
+    monkeypatch.setattr(transport, "cg", counted)
+    assert tortuosity(blobs(), 0) > 1
+    assert 0 < len(iterations) < 60
 
 
 def test_a_straight_channel_has_the_tortuosity_1_and_a_wall_none() -> None:
