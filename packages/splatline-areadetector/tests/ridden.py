@@ -146,7 +146,11 @@ class RideProgram:
             self.process = subprocess.Popen([sys.executable, *begin, *words], stdout=stream, stderr=subprocess.STDOUT)
 
     def __enter__(self) -> Self:
-        return self.wait_for(lambda: "Waiting for the first frame" in self.output)
+        try:
+            return self.wait_for(lambda: "Waiting for the first frame" in self.output)
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __exit__(self, *error: object) -> None:
         self.process.kill()
@@ -156,7 +160,7 @@ class RideProgram:
     def output(self) -> str:
         return self._output.read_text(encoding="utf-8")
 
-    def wait_for(self, reached: Callable[[], bool], seconds: float = 120.0) -> Self:
+    def wait_for(self, reached: Callable[[], bool], seconds: float = 400.0) -> Self:
         deadline = time.monotonic() + seconds
         while not reached():
             assert time.monotonic() < deadline and self.process.poll() is None, self.output

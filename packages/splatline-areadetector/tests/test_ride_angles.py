@@ -37,9 +37,14 @@ def _rows(kind: int, triggers: Iterable[int], first: int, step: int = 1, word: s
     return [(kind, i, first + step * n, {"HDF5FrameLocation": told}) for n, i in enumerate(triggers)]
 
 
-def _send(ioc: FakeIoc, rows: Iterable[Any], period: float = 0.02) -> None:
-    for kind, i, number, attributes in rows:
-        ioc.post(array_value(_pixels(kind, i), number, attributes))
+def _send(
+    ioc: FakeIoc, rows: Iterable[Any], period: float = 0.02, begin: float | None = None, stated: float = 0.0
+) -> None:
+    """Send frames, one each `period` s. `begin`: the time that the first one states, each later one `stated` s later;
+    None: the time at which it is sent."""
+    for n, (kind, i, number, attributes) in enumerate(rows):
+        seconds = None if begin is None else begin + n * stated
+        ioc.post(array_value(_pixels(kind, i), number, attributes, seconds))
         time.sleep(period)
 
 
@@ -106,12 +111,12 @@ def test_a_ride_that_subscribes_late_says_that_it_may_be_the_first_that_are_miss
     """Also where the server restarts meanwhile, in both files, and at a stop."""
     with FakeIoc() as ioc:
         _send(ioc, _rows(0, range(5), 1))  # before the ride subscribes
-        ioc.post(array_value(_pixels(0, 5), 6, seconds=time.time() + 1.5))  # about when the first one comes
+        before = time.time()  # the IOC's times are exact, however late this process sends
+        ioc.post(array_value(_pixels(0, 5), 6, seconds=before))
 
         def scan(stop: StopRequest) -> None:
-            time.sleep(1.0)
-            _send(ioc, _rows(0, range(6, 12), 7), 0.5)
-            _send(ioc, _rows(0, range(13, 16), 1), 0.1)  # the numbers begin anew
+            _send(ioc, _rows(0, range(6, 12), 7), begin=before + 0.5, stated=0.5)
+            _send(ioc, _rows(0, range(13, 16), 1), begin=before + 4.0, stated=0.1)  # the numbers begin anew
             time.sleep(2.5)
             stop.stop("the test waits no longer")
 
