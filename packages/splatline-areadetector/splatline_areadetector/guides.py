@@ -55,6 +55,9 @@ class Guide(Protocol):
     def phase(self, frame: ArrayFrame) -> Phase:
         """What the scan did while the frame was taken."""
 
+    unknown_angle: str
+    """Why `angle` is NaN, as a clause."""
+
     def angle(self, frame: ArrayFrame, trigger: int) -> float:
         """Radians of a projection; NaN: nothing tells it."""
 
@@ -107,7 +110,7 @@ def kind_of(word: Any) -> FrameKind | None:
 class _ByNumbers:
     """A scan whose plan stands in the configuration."""
 
-    status, told_by = "", "plan"
+    status, told_by, unknown_angle = "", "plan", "nothing tells its angle"
 
     def __init__(self, ride: RideSection, angles: NDArray[np.float64]) -> None:
         self._ride, self._angles = ride, angles
@@ -155,6 +158,7 @@ class AttributeGuide(_ByNumbers):
     def __init__(self, ride: RideSection, angles: AttributeAngles) -> None:
         super().__init__(ride, np.full(angles.views, np.nan))
         self._name, self._seen = angles.name, False
+        self.unknown_angle = f"its attribute {angles.name}, which tells its angle, is missing or is no angle in degrees"
 
     def phase(self, frame: ArrayFrame) -> Phase:
         self._seen = self._seen or self._name in frame.attributes
@@ -307,11 +311,13 @@ class TomoscanGuide:
         DeviceTimeout: tomoscan does not answer.
     """
 
+    unknown_angle = "tomoscan's plan has no angle for it"
+
     def __init__(self, ride: RideSection, angles: TomoscanAngles, now: Callable[[], float] = time.time) -> None:
         self._ride, self._prefix = ride, angles.prefix
         self._kinds = None if ride.kinds is None else _Kinds(ride.kinds)
         self._variables = Variables(angles.prefix, _TOMOSCAN, _NEEDED, now)
-        self._delay = math.inf  # of frames
+        self._delay, self._longest = math.inf, -math.inf  # of frames
         self._angles = np.empty(0)
 
     @property
@@ -350,7 +356,8 @@ class TomoscanGuide:
 
     def phase(self, frame: ArrayFrame) -> Phase:
         if not frame.is_current:
-            self._delay = min(self._delay, frame.received - frame.time)
+            delay = frame.received - frame.time
+            self._delay, self._longest = min(self._delay, delay), max(self._longest, delay)
         serial, kind = self._collecting(frame.time)
         if kind is None or self._kinds is None:
             return Phase(serial, kind)
@@ -375,9 +382,10 @@ class TomoscanGuide:
         return kind if not types or kind_of(types[-1]) in (kind, None) else None
 
     def _at(self, history: History, seconds: float) -> list[Any]:
-        """The values until a time of the camera's IOC, whose clock may be another than tomoscan's."""
+        """The values until a time of the camera's IOC, whose clock may be another than tomoscan's: by more than the
+        delays of frames differ, as they do on a busy computer, where the few values come late by as much."""
         skew = 0.0 if history.delay is None or math.isinf(self._delay) else self._delay - history.delay
-        return [*history.until(seconds + (skew if abs(skew) > SKEW else 0.0))]
+        return [*history.until(seconds + (skew if abs(skew) > SKEW + self._longest - self._delay else 0.0))]
 
     def angle(self, frame: ArrayFrame, trigger: int) -> float:
         return float(self._angles[trigger]) if trigger < self._angles.size else math.nan

@@ -257,7 +257,7 @@ class RiddenFrames:
             if math.isnan(angle):
                 kind = FrameKind.INVALID
                 self._sorter.lose(place)
-                self._cannot_use(frame, "nothing tells its angle, so that it is kept as an invalid row")
+                self._cannot_use(frame, f"{self._guide.unknown_angle}, so that it is kept as an invalid row")
             else:
                 self._views += 1
         seconds = seconds_of(frame.attributes.get(EXPOSURE)) or self._plan.exposure(place.kind)

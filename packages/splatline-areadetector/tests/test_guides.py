@@ -94,6 +94,26 @@ def test_tomoscans_kinds_although_its_clock_is_half_an_hour_off(tmp_path: Path) 
     assert (plan.exposure(FrameKind.FLAT), plan.exposure(FrameKind.DARK)) == (0.01, 0.03)
 
 
+@pytest.mark.usefixtures("loopback")
+def test_frames_that_a_busy_computer_takes_late_have_the_kinds_of_their_times(tmp_path: Path) -> None:
+    """All came late, by times that differ: no other clock, by which a kind would change before its time."""
+    with FakeIoc() as ioc:
+        ioc.tomoscan(**TOMOSCAN)
+        config = config_of(tmp_path, ioc.url, {"from": "tomoscan", "prefix": "pva://T:TomoScan:"}, exposure_s=None)
+        guide: Any = guide_of(config.ride)
+        for delay in (0.9, 2.5):
+            guide.phase(_frame(1, 100.0, 100.0 + delay))
+        begin = time.time()
+        for n, (status, frame_type) in enumerate((("dark", "DarkField"), ("flat", "FlatField"))):
+            ioc.put({"TomoScan:ScanStatus": f"Collecting {status} fields", "TomoScan:FrameType": frame_type}, begin + n)
+        deadline, newest = begin + 60, ("Collecting flat fields", "FlatField")
+        while (guide.status, guide._variables.text("FrameType")) != newest and time.time() < deadline:
+            time.sleep(0.05)
+        assert guide.phase(_frame(2, begin + 0.9, begin + 1.9)).kind is FrameKind.DARK
+        assert guide.phase(_frame(3, begin + 1.1, begin + 2.1)).kind is FrameKind.FLAT
+        guide.close()
+
+
 def test_kinds_by_order_and_by_attribute(tmp_path: Path) -> None:
     angles = {"from": "attribute", "views": 3}
     guide = guide_of(config_of(tmp_path, "pva://P:I", angles, darks={"count": 2, "at": "both"}).ride)

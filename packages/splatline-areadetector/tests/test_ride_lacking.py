@@ -97,7 +97,9 @@ def test_an_attribute_that_one_frame_lacks_costs_that_frame_alone(tmp_path: Path
         told = ride_along(config_of(tmp_path, ioc.url, {"from": "attribute", "views": 20}), tmp_path, scan)
     (file,) = stored(tmp_path)
     assert isinstance(told.error, LedgerError) and "1 of 20 projections is missing: 6" in str(told.error)
-    assert "1 frame came (7) but could not be used: nothing tells its angle" in str(told.error)
+    assert "1 frame came (7) but could not be used: its attribute SampleRotary, which tells its angle, is missing" in (
+        str(told.error)
+    )
     assert file.kinds.tolist() == [0] * 6 + [3] + [0] * 13 and len(file.ids) == 20
     assert np.allclose(np.delete(file.degrees, 6), np.delete(9.0 * np.arange(20), 6))
 
