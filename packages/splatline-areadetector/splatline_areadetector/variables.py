@@ -205,10 +205,10 @@ def _over_ca(adders: dict[str, Add]) -> Callable[[], None]:
             for name, add in adders.items()
         ]
 
-    subscriptions = asyncio.run_coroutine_threadsafe(start(), _loop()).result()
-
-    def close() -> None:
+    async def end() -> None:
         for each in subscriptions:
-            _loop().call_soon_threadsafe(each.close)
+            each.close()
 
-    return close
+    subscriptions = asyncio.run_coroutine_threadsafe(start(), _loop()).result()
+    # It waits: aioca closes what is left when the program ends, in another thread, which crashes in the midst of ours.
+    return lambda: asyncio.run_coroutine_threadsafe(end(), _loop()).result()

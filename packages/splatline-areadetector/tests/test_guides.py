@@ -303,6 +303,23 @@ def test_variables_that_do_not_answer() -> None:
             Variables("pva://T:", ("a", "c"), ("c",))
 
 
+@pytest.mark.usefixtures("loopback")
+def test_variables_by_channel_access_are_closed_when_close_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that ends meanwhile crashes in the library."""
+    aioca, closed = pytest.importorskip("aioca"), list[str]()
+    close = aioca.Subscription.close
+
+    def slowly(subscription: Any) -> None:
+        time.sleep(0.1)
+        close(subscription)
+        closed.append(subscription.name)
+
+    monkeypatch.setattr(aioca.Subscription, "close", slowly)
+    with Variables("ca://NOBODY:", ("a", "b")) as there:
+        assert there.number("a") is None
+    assert closed == ["NOBODY:a", "NOBODY:b"]
+
+
 @pytest.mark.slow
 def test_text_and_labels_by_channel_access(loopback: dict[str, str]) -> None:
     """tomoscan's ScanStatus is an array of characters."""
