@@ -270,6 +270,13 @@ def _panda_problem(rows: Any) -> str:
 def _unit_problem(rows: NDArray[np.float64], settings: PandaAngles) -> str:
     """Why rows are no degrees, as a sentence's end; "" if they can be, or the configuration says what their unit is."""
     known = rows[np.isfinite(rows)]
+    degrees = settings.offset_deg + settings.deg_per_unit * known
+    if known.size and (np.abs(degrees) > MOST_DEGREES).all():
+        return (
+            f"has positions from {known.min():.7g} to {known.max():.7g}, which is more than {MOST_DEGREES:g} degrees "
+            "from zero; set ride.angles.deg_per_unit if they are encoder counts, and ride.angles.offset_deg to bring "
+            "the first angle near zero"
+        )
     if rows.size < _FEW or "deg_per_unit" in settings.model_fields_set:
         return ""
     step = 0.0 if known.size < _FEW else float(np.median(np.abs(np.diff(known))))

@@ -178,6 +178,7 @@ DEGREES = np.linspace(0.0, 171.0, 20)
         (np.arange(20) * 5000, "has steps of 5000, as of encoder counts; set ride.angles.deg_per_unit to 360 / counts"),
         (np.arange(20) * -50.0, "as of encoder counts"),
         (np.arange(20) * 1234.5, "as of encoder counts"),
+        (DEGREES + 3.6e6, r"3600171, which is more than 1e\+06 degrees from zero; set ride.angles.deg_per_u"),
         (np.full(20, np.nan), "has 0 positions in 20 rows, and they do not change"),
         (np.full(20, 7.0), "has 20 positions in 20 rows, and they do not change"),
     ],
@@ -209,6 +210,7 @@ def test_a_file_that_is_no_hdf5_is_refused_before_the_scan(tmp_path: Path) -> No
         (9 * np.arange(20), {}, "0° to 171°"),
         (np.radians(DEGREES), {"deg_per_unit": 57.29577951308232}, "0° to 171°"),
         (np.arange(20) * 5000, {"deg_per_unit": 0.0018, "offset_deg": -5}, "-5° to 166°"),
+        (DEGREES + 3.6e6, {"offset_deg": -3.6e6}, "0° to 171°"),
         (np.arange(20) * 137.5077, {}, "0° to 2612.65°"),  # golden angles
         (np.radians(DEGREES), {"deg_per_unit": 1}, "0° to 2.98451°"),  # a degree it is, says the configuration
     ],
