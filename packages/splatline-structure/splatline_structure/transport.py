@@ -61,7 +61,7 @@ def tortuosity(mask: Mask, axis: int, spacing: Spacing = (1, 1, 1)) -> float:
     straight = 1 - (np.nonzero(through)[0] + 0.5) / length
     laplace = diags_array(diagonal) - links
     block = _blocks_of(through)
-    members = csr_array((np.ones(n), (np.arange(n), block)))
+    members = csr_array((np.ones(n), block, np.arange(n + 1)))
     of_blocks = splu((members.T @ laplace @ members).tocsc())
 
     def nearly_solved(residual: F64) -> F64:
@@ -78,4 +78,4 @@ def _blocks_of(mask: Mask) -> NDArray[np.int64]:
     """The number of the block that each voxel of a mask is in; blocks without one have no number."""
     edge = max(_BLOCK, -(-max(mask.shape) // _BLOCKS))
     places = np.ravel_multi_index(tuple(each // edge for each in np.nonzero(mask)), mask.shape)
-    return np.asarray(np.unique(places, return_inverse=True)[1])
+    return np.asarray((np.cumsum(np.bincount(places) > 0) - 1)[places])
