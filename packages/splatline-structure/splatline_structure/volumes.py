@@ -103,8 +103,8 @@ def read_volume(
         if voxel_um is not None:
             if record.length_unit == "mm" and not np.allclose(voxel_um, stated := 1e3 * np.array(grid.spacing), 0.01):
                 warn(
-                    f"{path} states voxels of {_edges(stated)} µm (z x y x x), which are not those of --voxel-um: "
-                    f"{_edges(voxel_um)} µm are taken."
+                    f"{path} states voxels with edges of {_edges(stated)} µm (z x y x x). The edges of --voxel-um "
+                    f"are used instead: {_edges(voxel_um)} µm. Leave --voxel-um out to use those of the file."
                 )
             grid = Grid(grid.shape, voxel_um[2] * 1e-3, slice_pitch=voxel_um[0] * 1e-3)
         n_slices = grid.shape[0]

@@ -307,7 +307,7 @@ def test_labels_edges_and_options_are_said_back(here: Path) -> None:
     words = ("structure", "three.npz", "--voxel-um", "10", "--quick", "--crop", "none", "--side", "1", "-o", "o")
     result = beamline(*words)
     assert result.exit_code == 0, result.output
-    assert "states voxels of 30 x 10 x 10 µm" in result.stderr
+    assert "states voxels with edges of 30 x 10 x 10 µm" in result.stderr and "used instead: 10 x 10" in result.stderr
     assert "is taken as labels, not as grey values: the value 0 is material 1, 1 is material 2." in result.stderr
     settings = json.loads((here / "o/structure.json").read_text(encoding="utf-8"))
     assert " ".join(words) in json.dumps(settings)
