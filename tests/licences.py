@@ -135,8 +135,8 @@ def page() -> str:
         "[dependencies](decisions/dependencies.md).",
         "Three libraries have other licences. Wheels of numpy and scipy hold libgfortran, and those of torch hold\n"
         "libgomp: both are under the GPL, with the exception that lets any program use them. pyusb loads the libusb\n"
-        "of the system (LGPL). A driver for DCAM cameras loads the vendor's library. libusb and the vendor's library are\n"
-        "not part of any wheel of ours.",
+        "of the system (LGPL). A driver for DCAM cameras loads the vendor's library. libusb and the vendor's library\n"
+        "are not part of any wheel of ours.",
         "`python -m tests.licences` writes this page from the metadata of the packages that are installed, including\n"
         "the packages that these bring. A test fails if an installed package has no row, or if a package that users\n"
         "install is under the GPL. Packages for tests and docs are not listed, because no user needs them.",
