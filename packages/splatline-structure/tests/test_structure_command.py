@@ -256,7 +256,7 @@ REFUSED = [
     (("can.npy", "--voxel-um", "3:2:1"), 2, "pixels of a slice must be squares"),
     (("labels.npy", *VOXEL_UM, "--materials", "2"), 5, "so they are labels and not grey values"),
     (("big.npz", *VOXEL_UM, "--memory", "10K"), 5, "Unpacked it has 830 kB, and 10 kB are allowed"),
-    (("holes.npy", *VOXEL_UM), 5, "voxels of nan.npy are not finite"),
+    (("holes.npy", *VOXEL_UM), 5, "holes.npy are not finite"),
     (("small.npy", *VOXEL_UM), 5, "expected 8 or more along each side"),
     (("can.npy", *VOXEL_UM, "--slices", "3", "99"), 5, "has slices 0 to 40"),
     (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "8 slices of 72 x 72 voxels need 9.75 MB, and 4 MB are allowed"),
