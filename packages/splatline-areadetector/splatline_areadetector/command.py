@@ -72,6 +72,8 @@ def ride(
 
     Exit codes: 0 the scan is complete, 2 the configuration or the IOC's settings are wrong, 3 no server answers,
     4 stopped, 5 frames are missing (a message says which, and who lost them), 7 alarms of the monitor.
+
+    Example: beamline ride my.yaml --page
     """
     from beamline.config.load import load_as
     from splatline_areadetector.config import RideConfig

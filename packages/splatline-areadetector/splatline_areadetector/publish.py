@@ -55,6 +55,8 @@ def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | 
     reaches the address can have frames written below that folder.
 
     Exit codes: 0 ended by Ctrl-C, 2 p4p or softioc is not installed, 5 the address or port cannot be used.
+
+    Example: beamline publish runs --prefix 2bma:SPL: --bind 0.0.0.0
     """
     from splatline_areadetector.publish_detector import PublishedDetector, records
     from splatline_areadetector.publish_frames import RunFrames

@@ -200,8 +200,8 @@ class _Taken:
 def not_set(number: int) -> str:
     """The message about numbers that stay the same."""
     return (
-        "The server must set uniqueId of its NTNDArray to the count of frames, because beamline ride identifies frames "
-        f"by it: uniqueId stays at {number} while the pixels change"
+        f"uniqueId stays at {number} while the pixels change. Have the server set uniqueId of its NTNDArray to the "
+        "count of frames, because beamline ride identifies frames by it"
     )
 
 

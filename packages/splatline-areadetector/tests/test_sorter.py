@@ -471,7 +471,7 @@ def test_no_frame_has_a_wrong_angle_without_a_word(scan: Scan) -> None:
             if isinstance(pair[1], NewEpoch):
                 break
     except DataError as error:
-        assert "must set uniqueId" in str(error) and is_faulty
+        assert "uniqueId stays at" in str(error) and is_faulty
         return
     views = [(seen.frame[:2], place) for seen, place in decided if isinstance(place, Place) and place.kind is VIEW]
     wrong = [(truth, place) for truth, place in views if truth != (VIEW, place.trigger)]

@@ -50,7 +50,12 @@ def emission() -> None:
 def simulate(
     output: Path, truth: Path | None, views: int, shape: tuple[int, int], trues: float, seed: int, as_json: bool
 ) -> None:
-    """Simulate counts of hot and cold rods in water (after NEMA NU 4-2008), with pixels of 1 mm."""
+    """Simulate counts of hot and cold rods in water.
+
+    The phantom follows NEMA NU 4-2008; pixels are 1 mm.
+
+    Example: beamline emission simulate -o pet.h5 --truth truth.h5
+    """
     import numpy as np
 
     from beamline.core.quantities import VoxelKind
@@ -93,7 +98,9 @@ def simulate(
 def recon(
     file: Path, output: Path, method: str, iterations: int | None, subsets: int, seed: int, as_json: bool
 ) -> None:
-    """Reconstruct the activity from the counts in FILE, in counts per mm of line.
+    """Reconstruct the activity from counts.
+
+    The activity is in counts per mm of line.
 
     Example: beamline emission recon pet.h5 -o activity.h5
     """

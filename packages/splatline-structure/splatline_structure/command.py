@@ -78,14 +78,14 @@ class Seen:
 @click.option(
     "--particles",
     type=click.IntRange(1),
-    help="Which material is the particles, counted from 1, the least dense. Default: the densest.",
+    help="Number of the material that forms the particles, from 1, the least dense. Default: the densest.",
 )
 @click.option(
     "--through",
     type=click.IntRange(1),
     default=1,
     show_default=True,
-    help="Which material the connected share and the tortuosity are measured in, counted from 1.",
+    help="Number of the material in which the connected share and the tortuosity are measured, from 1.",
 )
 @click.option(
     "--parts",
@@ -173,12 +173,13 @@ class Seen:
 )
 @json_option
 def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_json: bool, **values: Any) -> None:
-    """Measure the microstructure of VOLUME: fractions of materials, particles, surface, contacts, cracks, connected
-    share and tortuosity. Each number has an interval of 80 %.
+    """Measure the microstructure of a volume, each number with an interval.
 
-    The interval has four causes: few projections (the volume is reconstructed again from each half of them), uncertain
-    grey levels of the materials, the size of a voxel, and the number of particles. A number whose interval is wider
-    than half of its value is printed as not determined.
+    Measured are fractions of materials, particles, surface, contacts, cracks, connected share and tortuosity.
+
+    Each interval is one of 80 %. It has four causes: few projections (the volume is reconstructed again from each half
+    of them), uncertain grey levels of the materials, the size of a voxel, and the number of particles. A number whose
+    interval is wider than half of its value is printed as not determined.
 
     Several volumes are a series in time. The new folder contains report.html, numbers.csv, structure.json,
     particles.csv and labels.
@@ -250,7 +251,7 @@ def measured(path: Path, read: ReadSlices, box: Box, answer: Answer, **values: A
     particles = values["particles"] or n_materials
     if labels.size not in (0, n_materials):
         raise ValueError(
-            f"leave out --materials {n_materials}: the volume holds {labels.size} different values "
+            f"leave out --materials {n_materials}, because the volume holds {labels.size} different values "
             f"({', '.join(f'{each:g}' for each in labels)}), so they are labels and not grey values, and each label is "
             "a material"
         )

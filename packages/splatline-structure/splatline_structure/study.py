@@ -62,7 +62,9 @@ def study_structure(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Show how numbers of a microstructure, with their intervals, depend on the number of projections of SCAN.
+    """Show how many projections the numbers of a microstructure need.
+
+    SCAN is reconstructed with each number of projections. The result shows each number with its interval.
 
     Before a beamtime, use a SCAN of `beamline simulate`: the result says how many projections a wanted interval needs.
 

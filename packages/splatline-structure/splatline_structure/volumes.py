@@ -270,7 +270,8 @@ def parts_of(
     record, facts, at = read.record, read.record.parameters, read.slices
     if math.isnan(record.axis_col):
         raise ValueError(
-            "give --parts or --quick: the volume does not state the rotation axis, which is needed to reconstruct the "
+            "give --parts or --quick, because the volume does not state the rotation axis, which is needed to "
+            "reconstruct the "
             "halves"
         )
     rows: Any = None if facts.get("rows", "all") == "all" else tuple(map(int, str(facts["rows"]).split(":")))
@@ -283,7 +284,8 @@ def parts_of(
         if selected.cone is None:
             if (end - first) // side != read.n_slices:
                 raise ValueError(
-                    f"give --parts or --quick: the volume has {read.n_slices} slices, but rows {first}:{end} of its "
+                    f"give --parts or --quick, because the volume has {read.n_slices} slices, but rows {first}:{end} "
+                    "of its "
                     f"scan give {(end - first) // side}"
                 )
             low, high = max(at.start - _BESIDE, 0), min(at.stop + _BESIDE, read.n_slices)
@@ -291,7 +293,8 @@ def parts_of(
             at = slice(at.start - low, at.stop - low)
         elif read.limit_sentence:
             raise ValueError(
-                "give --quick or --parts: halves of cone-beam projections must be reconstructed whole, and do not fit "
+                "give --quick or --parts, because halves of cone-beam projections must be reconstructed whole, and do "
+                "not fit "
                 "the memory"
             )
         prepared = prepare_projections(source, selection, warn)

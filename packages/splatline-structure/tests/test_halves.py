@@ -159,7 +159,8 @@ def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(her
     read = read_volume(here / "v.npy", None, (2, 2, 2), None, 10**9, "square")
     read = replace(read, record=replace(read.record, parameters={"axis_col": 23.5}))
     with pytest.raises(
-        ValueError, match=r"give --parts or --quick: the volume has 10 slices, but rows 0:16 of its scan give 16"
+        ValueError,
+        match=r"give --parts or --quick, because the volume has 10 slices, but rows 0:16 of its scan give 16",
     ):
         parts_of(read, here / "scan.h5", 2, pytest.fail, lambda *_: None)
 
@@ -167,7 +168,7 @@ def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(her
 def test_halves_of_a_volume_without_an_axis_are_refused_with_a_way_out(here: Path) -> None:
     np.save(here / "v.npy", np.random.default_rng(0).random((16, 48, 48), np.float32))
     result = beamline("structure", "v.npy", "--voxel-um", "2", "--scan", "scan.h5")
-    words = "v.npy cannot be measured: give --parts or --quick: the volume does not state the rotation axis"
+    words = "v.npy cannot be measured: give --parts or --quick, because the volume does not state the rotation axis"
     assert result.exit_code == 5 and words in result.stderr
     assert left(here) == {"scan.h5", "v.npy"}
 

@@ -32,12 +32,15 @@ def _device_name(ctx: click.Context, param: click.Parameter, value: str) -> str:
     help="Let clients pause, resume, stop and abort the scan, and decide what it measures next.",
 )
 def tango(runs: Path, device: str, bind: str, port: int, instance: str | None, control: bool) -> None:
-    """Serve the running scan as a Tango device: the newest run of the folder RUNS (default ./runs).
+    """Serve the running scan as a Tango device.
 
-    The command only reads the files of the run, so it cannot slow a scan down. Tango has no passwords: with --control,
-    everybody who reaches the address can end a scan.
+    The device is the newest run of the folder RUNS (default ./runs). The command only reads the files of the run, so
+    it cannot slow a scan down. Tango has no passwords: with --control, everybody who reaches the address can end a
+    scan.
 
     Exit codes: 0 ended by Ctrl-C, 5 the address cannot be used, or the database does not answer.
+
+    Example: beamline tango runs --device id19/tomo/scan --bind 0.0.0.0
     """
     from splatline_tango.device import ServerPlace, serve
 
