@@ -1,4 +1,4 @@
-"""The camera driver for areaDetector keeps the laws of every camera, against a fake IOC, and says what is wrong."""
+"""The camera driver for areaDetector passes the suite of all cameras against a fake IOC, and reports what is wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NTNDArrays as frames: pixels by codec, window, attributes; the stream that holds them."""
+"""NTNDArrays become frames: decoded pixels, window, attributes; and the stream of frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tells kinds and angles: histories of variables, tomoscan's status, attributes, a PandABox's file."""
+"""Where kinds and angles come from: histories of variables, tomoscan's status, attributes, a PandABox's file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames of a run, each once and in order, as clients of areaDetector see them; what they ask, and what is refused."""
+"""`beamline publish`: clients see each frame of a run once and in order; their requests, and errors."""
 
 from __future__ import annotations
 

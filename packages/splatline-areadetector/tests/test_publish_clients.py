@@ -1,4 +1,4 @@
-"""Clients of others ride on a scan of ours: bluesky's by both protocols, p4p, and a viewer; one that stands still."""
+"""Programs of others read a published scan: bluesky over both protocols, p4p, a viewer, and a client that stalls."""
 
 from __future__ import annotations
 

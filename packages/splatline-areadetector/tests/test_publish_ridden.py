@@ -1,4 +1,4 @@
-"""A scan of ours, published, and ridden by ours: both files hold the same frames, to the bit."""
+"""`beamline ride` records a scan that `beamline publish` serves: both files hold the same frames, to the bit."""
 
 from __future__ import annotations
 

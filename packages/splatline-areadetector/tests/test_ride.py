@@ -1,4 +1,4 @@
-"""A ride on a fake IOC: kinds, angles, what is missing and why, where files end, and what is refused."""
+"""`beamline ride` with a fake IOC: kinds, angles, missing frames and their cause, ends of files, errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A ride stores each frame at its angle, or says which it does not know: what IOCs do with the numbers of frames."""
+"""`beamline ride` stores each frame with its angle, or reports those it does not know, whatever the frame numbers
+do."""
 
 from __future__ import annotations
 

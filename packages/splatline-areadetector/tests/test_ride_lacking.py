@@ -1,4 +1,4 @@
-"""Rides of scans from which little comes: no projection, no frame that can be decoded, no angle for some."""
+"""`beamline ride` if little arrives: no projection, no frame that can be decoded, no angle for some frames."""
 
 from __future__ import annotations
 

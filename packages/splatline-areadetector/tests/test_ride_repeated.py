@@ -1,4 +1,4 @@
-"""`beamline ride --repeat`: one scan after the other until Ctrl-C, also after one that lacks frames."""
+"""`beamline ride --repeat`: one scan after the other until Ctrl-C, also after a scan with missing frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A ride on the simulator of APS (pvapy), as programs: a real scan, a ride that stands still, a server that dies."""
+"""`beamline ride` with APS's simulator (pvapy), as programs: a real scan, a process that stalls, a server that dies."""
 
 from __future__ import annotations
 

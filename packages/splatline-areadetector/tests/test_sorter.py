@@ -1,4 +1,4 @@
-"""Which trigger each number belongs to, and where a file ends."""
+"""The sorter: which trigger each frame number belongs to, and when a file ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slabs made by workers of dask.distributed are equal to the bit, also after a worker is lost."""
+"""Slabs from workers of dask.distributed are bit-identical, also after a worker is lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`beamline emission`: counts with the law that they are drawn from, their file, and activity behind them."""
+"""`beamline emission`: simulated counts follow their distribution, their file, the reconstructed activity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MLEM against a general optimiser, its likelihood, and the counts that it keeps; attenuation and randoms given."""
+"""MLEM compared with a general optimiser: likelihood and total counts, with known attenuation and randoms."""
 
 from __future__ import annotations
 

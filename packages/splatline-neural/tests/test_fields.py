@@ -1,4 +1,4 @@
-"""Neural fields as methods: what a fit finds, what ends it, what it refuses."""
+"""Neural fields as methods: what a fit finds, what ends it, and its errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`beamline xafs`: scenes, tables, radiographs and series, and what is refused."""
+"""`beamline xafs`: scenes, tables, radiographs and series, and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`beamline materials`: charged and fresh grains from simulated scans around an edge; no half output."""
+"""`beamline materials`: charged and fresh grains from simulated scans around an edge; no half-written output."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Energy scan: frames are the scene's at each energy, regions are where the material is, grey is refused."""
+"""Scenes at several energies: frames are right at each energy, regions show the material, grey samples are errors."""
 
 from __future__ import annotations
 

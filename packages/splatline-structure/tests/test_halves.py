@@ -1,4 +1,4 @@
-"""A scan's volume from each half of its views, and numbers against the number of views."""
+"""Volumes from each half of the projections of a scan, and numbers against the number of projections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Intervals of sizes, by the particles that are there; of all slices, by those of the middle; of a change."""
+"""Intervals: of sizes, from the number of particles; of all slices, from the measured slices; of a change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers of labels: those of other libraries and of formulas."""
+"""Numbers of labelled volumes, compared with other libraries and with formulas."""
 
 from __future__ import annotations
 

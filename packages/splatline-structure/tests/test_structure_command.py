@@ -1,4 +1,4 @@
-"""`beamline structure`: files, numbers, the words of intervals, two states, and refusals."""
+"""`beamline structure`: files, numbers, explanations of intervals, two states, errors."""
 
 from __future__ import annotations
 

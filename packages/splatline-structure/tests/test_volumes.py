@@ -1,4 +1,4 @@
-"""What is read of a file, and the box in it; balls in a can are found with number, size and place."""
+"""Which slices are read, and the box in them; balls in a can are found with number, size and position."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A client of Tango reads a run, its pictures and its end, and ends it where it may."""
+"""A Tango client reads a run, its pictures and its end, and ends it if it is allowed to."""
 
 from __future__ import annotations
 
