@@ -129,14 +129,17 @@ def page() -> str:
     base = brought(wanted(None))
     parts = [
         "# Licences",
-        "splatline is BSD-3-Clause. Its wheel holds one file of another project: uPlot 1.6.32, MIT, with its licence\n"
-        "beside it. `python -m tests.licences` writes this page from the metadata of what is installed, with what\n"
-        "packages bring in turn. A test fails where an installed package has no row, and where one that users install\n"
-        "is under the GPL. Packages of tests and docs, which no user needs, are not listed. What each direct\n"
-        "dependency is for: [dependencies](decisions/dependencies.md).",
-        "Wheels of numpy and scipy hold libgfortran, and those of torch libgomp: GPL with the exception that lets any\n"
-        "program use them. pyusb loads the system's libusb (LGPL), a driver for DCAM cameras the vendor's library;\n"
-        "neither is shipped.",
+        "With this page you can see under which licence each package is that comes with splatline.",
+        "splatline itself is BSD-3-Clause. Its wheel holds one file of another project, uPlot 1.6.32 (MIT), together\n"
+        "with its licence. What each package that we ask for is needed for:\n"
+        "[dependencies](decisions/dependencies.md).",
+        "Three libraries have other licences. Wheels of numpy and scipy hold libgfortran, and those of torch hold\n"
+        "libgomp: both are under the GPL, with the exception that lets any program use them. pyusb loads the libusb\n"
+        "of the system (LGPL). A driver for DCAM cameras loads the vendor's library. libusb and the vendor's library\n"
+        "are not part of any wheel of ours.",
+        "`python -m tests.licences` writes this page from the metadata of the packages that are installed, including\n"
+        "the packages that these bring. A test fails if an installed package has no row, or if a package that users\n"
+        "install is under the GPL. Packages for tests and docs are not listed, because no user needs them.",
         "## Every installation",
         _table(dict.fromkeys(base, ""), base),
         "## Extras for users",

@@ -187,17 +187,18 @@ def page() -> str:
     """The page as Markdown."""
     parts = [
         "# Public names",
-        "What stands here stays within a major version ([releases](releases.md#what-a-version-promises)), with the\n"
-        "parameters that must be given: they stand in brackets, those behind a star are given by name. Parameters\n"
-        "with a default may be added. What does not stand here may change with any version.\n"
-        "`python -m tests.public_names` writes this page; a test compares it with the modules.",
+        "With this page you can see which Python names you may rely on. The names below, and the parameters that must\n"
+        "be given, stay the same within a major version ([releases](releases.md#what-a-version-promises)). The\n"
+        "parameters that must be given are in brackets; those after a star are given by name. A later version may add\n"
+        "parameters with a default. Any other name may change with any version.",
+        "`python -m tests.public_names` writes this page, and a test compares it with the modules.",
         "## For scripts and notebooks",
         *map(_section, FOR_SCRIPTS),
         "## For plans of bluesky",
         *map(_section, FOR_BLUESKY),
         "## For packages that add devices, formats and methods",
-        "With the entry points `splatline.method`, `correction`, `reader`, `volume_format`, `stage`, `wire`,\n"
-        "`camera`, `check` and `effect` ([contributing](contributing.md)).",
+        "A package registers what it adds under the entry points `splatline.method`, `correction`, `reader`,\n"
+        "`volume_format`, `stage`, `wire`, `camera`, `check` and `effect` ([contributing](contributing.md)).",
         *map(_section, FOR_PACKAGES),
     ]
     return "\n\n".join(parts) + "\n"

@@ -1,4 +1,4 @@
-"""Rides of tests: the configuration, the ride in this process without a live volume, and what its file holds."""
+"""Helpers for tests of `beamline ride`: its configuration, a run in this process without a live volume, its file."""
 
 from __future__ import annotations
 

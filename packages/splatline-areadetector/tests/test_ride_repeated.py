@@ -1,4 +1,4 @@
-"""`beamline ride --repeat`: one scan after the other until Ctrl-C, also after one that lacks frames."""
+"""`beamline ride --repeat`: one scan after the other until Ctrl-C, also after a scan with missing frames."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ WAITING = "Waiting for the first frame"
 @pytest.mark.parametrize(
     ("scans", "in_the_midst", "code", "sentence"),
     [
-        ([range(1, 21), range(21, 41)], False, 0, "Recorded: 2 scans, of which 0 lack frames."),
+        ([range(1, 21), range(21, 41)], False, 0, "Recorded: 2 scans; in 0 of them frames are missing."),
         ([range(1, 21), [*range(21, 31), *range(32, 41)], range(41, 61)], False, 5,
-         "Recorded: 3 scans, of which 1 lacks frames. The last such: 1 of 20 projections is missing: 10"),
-        ([range(1, 21)], True, 4, "Recorded: 1 scan before this one, of which 0 lack frames."),
+         "Recorded: 3 scans; in 1 of them frames are missing. The last of these: 1 of 20 projections is missing: 10"),
+        ([range(1, 21)], True, 4, "Recorded: 1 scan before this one; in 0 of them frames are missing."),
     ],
 )  # fmt: skip
 def test_scan_after_scan_until_ctrl_c(

@@ -1,4 +1,4 @@
-"""Transport through a material: the share that connects two faces, and the tortuosity factor."""
+"""Transport through a material: the part that connects two faces, and the tortuosity factor."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from splatline_structure.materials import F64, Mask, Spacing
 
-_CLOSE = 1e-5  # residual of the solution, relative
-_BLOCK, _BLOCKS = 4, 24  # voxels along the edge of a block, at least; blocks along the longest side, at most
+_CLOSE = 1e-5  # relative residual at which the solver stops
+_BLOCK, _BLOCKS = 4, 24  # shortest edge of a block in voxels; most blocks along the longest side
 
 
 def connecting(mask: Mask, axis: int) -> Mask:
-    """The parts of a material that reach from one face across `axis` to the other one, by faces of voxels."""
+    """The parts of a material that connect the two faces across `axis`; voxels connect through their faces."""
     parts, _ = ndimage.label(mask)
     ends = np.moveaxis(parts, axis, 0)
     both = np.intersect1d(ends[0], ends[-1])
@@ -25,18 +25,19 @@ def connecting(mask: Mask, axis: int) -> Mask:
 
 
 def tortuosity(mask: Mask, axis: int, spacing: Spacing = (1, 1, 1)) -> float:
-    """Tortuosity factor along `axis`: share of the material over its relative diffusivity (Cooper et al. 2016).
+    """Tortuosity factor along `axis`: fraction of the material divided by its relative diffusivity (Cooper et al.
+    2016).
 
-    Laplace's equation in the material, with a difference of 1 between the two faces and no flux elsewhere, by
+    Solves Laplace's equation in the material, with a difference of 1 between the two faces and no flux elsewhere, with
     conjugate gradients. The preconditioner is the diagonal plus the exact solution for blocks of voxels, each with one
-    value; the diagonal alone needs eleven times as many iterations for a cube of 96 voxels. Two voxels conduct as the
-    area between them over their distance, relative to those along `axis`.
+    value; the diagonal alone needs eleven times as many iterations for a cube of 96 voxels. The conductance between two
+    voxels is the area between them divided by their distance, relative to voxels along `axis`.
 
     Args:
         spacing: edges of a voxel (z, y, x).
 
     Returns:
-        1 for a straight channel; infinity where nothing connects the faces.
+        1 for a straight channel; infinity if nothing connects the faces.
     """
     through = np.moveaxis(connecting(mask, axis), axis, 0)
     n, length = int(through.sum()), through.shape[0]
@@ -75,7 +76,7 @@ def tortuosity(mask: Mask, axis: int, spacing: Spacing = (1, 1, 1)) -> float:
 
 
 def _blocks_of(mask: Mask) -> NDArray[np.int64]:
-    """The number of the block that each voxel of a mask is in; blocks without one have no number."""
+    """The number of the block of each voxel of a mask; blocks without such a voxel get no number."""
     edge = max(_BLOCK, -(-max(mask.shape) // _BLOCKS))
     places = np.ravel_multi_index(tuple(each // edge for each in np.nonzero(mask)), mask.shape)
     return np.asarray((np.cumsum(np.bincount(places) > 0) - 1)[places])
