@@ -31,7 +31,8 @@ def zarr_library(path: Path) -> Any:
         import zarr
     except ImportError as error:
         raise DataError(
-            f"{path}: a Zarr needs zarr, which cannot be loaded here ({error}): pip install splatline[zarr]."
+            f"{path}: reading a Zarr needs the package zarr, which cannot be loaded ({error}): pip "
+            "install splatline[zarr]."
         ) from error
     return zarr
 
@@ -108,8 +109,9 @@ def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, ND
         if "bject" not in str(error):
             raise
         raise DataError(
-            f"{path} holds objects of Python among its arrays, which are pickles: these are never opened here, as one "
-            "may run any program. Save the arrays alone (numpy.save, numpy.savez). Nothing was read."
+            f"Save the arrays alone (numpy.save, numpy.savez): {path} contains Python objects among its "
+            "arrays. These are pickles, which this program never opens, because a pickle can run any "
+            "program. Nothing was read."
         ) from error
 
 
@@ -117,8 +119,8 @@ def require_room(path: Path, n: int) -> None:
     """Raise DataError if n bytes exceed the free memory: a damaged file may claim any size."""
     if n > (free := free_memory()):
         raise DataError(
-            f"{path} cannot be read: it says that it holds {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB of memory are "
-            "free; cut the volume or bin it."
+            f"{path} does not fit in memory: its header states {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB "
+            "are free. Crop or bin the volume."
         )
 
 
@@ -128,12 +130,13 @@ def open_array_file(path: Path, follow: bool = False) -> Any:
 
 
 _PICKLE = (
-    "{0} is a pickle, which is never opened here: it may run any program that its writer put into it. If you trust the "
-    'writer, convert FILE (as NAF and SAX-NeRF have it): python -c "import numpy as np, pickle; d = pickle.load(open('
-    "'FILE', 'rb')); np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
-    'print({k: v for k, v in d.items() if np.size(v) < 9})". It prints DSO, DSD and dDetector in mm. Then: beamline '
-    "recon views.npy --angles angles.npy --angles-unit rad --quantity line-integrals --cone DSO:DSD --pixel-size-um "
-    "1000*dDetector. Nothing was read."
+    "{0} is a pickle, which this program never opens, because a pickle can run any program that its "
+    "author put into it. If you trust the author, convert FILE (in the layout of NAF and SAX-NeRF) "
+    "yourself: python -c \"import numpy as np, pickle; d = pickle.load(open('FILE', 'rb')); "
+    "np.save('views.npy', d['train']['projections']); np.save('angles.npy', d['train']['angles']); "
+    'print({k: v for k, v in d.items() if np.size(v) < 9})". It prints DSO, DSD and dDetector in mm. '
+    "Then: beamline recon views.npy --angles angles.npy --angles-unit rad --quantity line-integrals "
+    "--cone DSO:DSD --pixel-size-um 1000*dDetector. Nothing was read."
 )
 _PICKLES, _NUMPY = (".pickle", ".pkl", ".pck"), (".npy", ".npz")
 

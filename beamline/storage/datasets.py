@@ -106,8 +106,8 @@ def values_of(item: h5py.Dataset) -> Any:
     """All values of a number, a text or a list of a scan. DataError: it holds more than BRIEF bytes."""
     if (n := (item.size or 0) * item.dtype.itemsize) > BRIEF:
         raise DataError(
-            f"{item.name} in {item.file.filename} holds {n / 1e9:.3g} GB; expected a number, a text or a list of "
-            f"{BRIEF / 1e9:.3g} GB at most. Nothing was read."
+            f"{item.name} in {item.file.filename} contains {n / 1e9:.3g} GB; expected a number, a text or "
+            f"a list of at most {BRIEF / 1e9:.3g} GB. Nothing was read."
         )
     return read_part(item, ())
 
@@ -135,9 +135,9 @@ def read_part(item: Any, where: Any) -> Any:
         if lacking := next(_not_installed(stored), "") if isinstance(stored, h5py.Dataset) else "":
             folders = os.environ.get("HDF5_PLUGIN_PATH") or "not set"
             raise DataError(
-                f"{lacking}, which is not installed here. Put its HDF5 plugin into a folder that HDF5_PLUGIN_PATH "
-                f"names (now {folders}), or write the file again without the filter where it is installed: h5repack "
-                "-f NONE. Nothing was changed."
+                f"{lacking}, which is not installed here. Put the HDF5 plugin of this filter into a "
+                f"folder that HDF5_PLUGIN_PATH names (now {folders}), or, on a computer that has the "
+                "filter, write the file without it: h5repack -f NONE. Nothing was changed."
             ) from error
         raise
 
@@ -190,7 +190,7 @@ def broken_link(group: h5py.Group, path: str) -> str:
         link, there = here.get(name, getlink=True), resolve(here, name)
         if there is None and isinstance(link, h5py.SoftLink | h5py.ExternalLink):
             file = f"{link.filename}::" if isinstance(link, h5py.ExternalLink) else ""
-            return f"{here.name.rstrip('/')}/{name} is a link to {file}{link.path}, which is not there"
+            return f"{here.name.rstrip('/')}/{name} is a link to {file}{link.path}, which does not exist"
         here = there
     return ""
 
@@ -198,7 +198,7 @@ def broken_link(group: h5py.Group, path: str) -> str:
 def refuse_broken(group: h5py.Group, path: str) -> None:
     """Raise DataError if a path ends at a broken link."""
     if broken := broken_link(group, path):
-        raise DataError(f"{group.file.filename}: {broken}. Put the linked file back beside this one.")
+        raise DataError(f"{group.file.filename}: {broken}. Put the linked file back next to this one.")
 
 
 def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | None:
@@ -215,7 +215,7 @@ def dataset(group: h5py.Group, path: str, frames: int = 0) -> h5py.Dataset | Non
     if item is None or getattr(item, "shape", None) is None:
         return None
     if item.ndim == 1 and item.size > _FRAMES:
-        raise DataError(f"{item.name} in {item.file.filename} holds {item.size} values; expected {_FRAMES} at most.")
+        raise DataError(f"{item.name} in {item.file.filename} has {item.size} values; expected at most {_FRAMES}.")
     several = isinstance(item, h5py.Dataset) and item.ndim == 3 and item.chunks is not None and item.chunks[frames] > 1
     sizes = (bytes_unpacked(item, axis) for axis in (frames, int(not frames))) if several else ()
     if (kept := next((size for size in sizes if size <= HELD), 0)) > _CACHE:
@@ -270,13 +270,16 @@ def radians(item: h5py.Dataset, unit: str | None = None, default: str = "") -> N
     where = f"{item.name} in {item.file.filename}"
     angles, stated = _numbers(item)
     if angles is None:
-        raise DataError(f"{where} holds {_SORTS.get(item.dtype.kind, item.dtype)}; expected whole or real numbers.")
+        raise DataError(
+            f"{where} contains {_SORTS.get(item.dtype.kind, item.dtype)}; expected integers or real numbers."
+        )
     unit = unit or " and ".join(sorted(stated)) or default
     factor = factor_of(unit, ANGLE_UNITS)
     if factor is None:
         raise DataError(
-            f"{where} has {f'the units {unit!r}' if unit else 'no units attribute'}; expected degrees or radians. Set "
-            "the attribute, give --angles FILE (degrees, one a line), or with --angles-path --angles-unit deg or rad."
+            f"{where} has {f'the units {unit!r}' if unit else 'no attribute units'}; expected degrees or "
+            "radians. Set the attribute, give --angles FILE (degrees, one per line), or add "
+            "--angles-unit deg or rad to --angles-path."
         )
     return np.where(np.isfinite(angles), angles * factor, np.nan)
 
@@ -323,9 +326,10 @@ def missing_links(item: h5py.Dataset, whole: dict[tuple[str, str], bool] | None 
         lost.add(where if name == "." else str(path))
     if packed:
         raise DataError(
-            f"{item.name} in {item.file.filename} draws on {packed[0]}, whose attributes (scale_factor, ...) say that "
-            "its numbers are packed, and a virtual dataset passes them on as they are stored. Give it the same "
-            "attributes in a copy of the file, or store the values. Nothing was read."
+            f"{item.name} in {item.file.filename} is a virtual dataset. The values behind it, "
+            f"{packed[0]}, are packed (attributes scale_factor, ...), and a virtual dataset returns them "
+            "without unpacking. In a copy of the file, give the virtual dataset the same attributes, or "
+            "store unpacked values. Nothing was read."
         )
     return sorted(lost)
 
@@ -364,9 +368,10 @@ def require_possible(item: Any) -> int:
     packed = stored.id.get_create_plist().get_nfilters() if isinstance(stored, h5py.Dataset) else bool(stored.chunks)
     if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
         raise DataError(
-            f"{item.name} in {item.file.filename} is stored in pieces of {size(piece_of(item))}: to unpack one takes "
-            f"{size(needed)} of memory, {size(free)} are free. On a machine with more, copy it with one frame in each "
-            "chunk (h5repack -l CHUNK=...). Nothing was read."
+            f"{item.name} in {item.file.filename} is stored in chunks of {size(piece_of(item))}: "
+            f"unpacking one needs {size(needed)} of memory, and {size(free)} are free. On a computer with "
+            "more memory, copy the file with one frame per chunk (h5repack -l CHUNK=...). Nothing was "
+            "read."
         )
     return needed
 
@@ -395,10 +400,10 @@ def runs(rows: NDArray[np.integer]) -> list[tuple[int, int]]:
     return [(int(part[0]), int(part[-1]) + 1) for part in parts if part.size]
 
 
-_SORTS = {"c": "complex numbers", "b": "true and false", "V": "records", "O": "text", "S": "text", "U": "text"}
+_SORTS = {"c": "complex numbers", "b": "Boolean values", "V": "records", "O": "text", "S": "text", "U": "text"}
 
 
 def require_real(dtype: np.dtype[Any], what: str) -> None:
     """Raise DataError if pixels, keys or angles are not real numbers, such as text or complex numbers."""
     if dtype.kind not in "uif":
-        raise DataError(f"{what} holds {_SORTS.get(dtype.kind, str(dtype))}; expected whole or real numbers.")
+        raise DataError(f"{what} contains {_SORTS.get(dtype.kind, str(dtype))}; expected integers or real numbers.")

@@ -185,8 +185,8 @@ def reserve(descriptor: int, wanted: int, folder: Path) -> None:
     there, free = os.fstat(descriptor), shutil.disk_usage(folder).free
     taken = 512 * getattr(there, "st_blocks", (there.st_size + 511) // 512)
     refusal = (
-        f"{folder} has {size(free)} free, and {size(wanted - taken)} more are needed while the volume is made. Write "
-        "the output to another disk. Nothing was written."
+        f"Write the output to another disk: {folder} has {size(free)} free, and {size(wanted - taken)} "
+        "more are needed during the reconstruction. Nothing was written."
     )
     if wanted - taken > free:
         raise DataError(refusal)
@@ -251,7 +251,7 @@ class ToDisk:
                 last.start()
             last.join(_PATIENCE)
             if last.is_alive():
-                self._error = OSError(errno.ETIMEDOUT, f"the disk has not taken the file for {_PATIENCE:.0f} s")
+                self._error = OSError(errno.ETIMEDOUT, f"the disk has accepted no data for {_PATIENCE:.0f} s")
             if self._error is not None:
                 raise self._error
 

@@ -234,12 +234,13 @@ def write_legend(file: h5py.File) -> None:
     group.create_dataset("unit", data=[check.unit for check in CHECKS], dtype=text)
     group.create_dataset("meaning", data=[check.meaning for check in CHECKS], dtype=text)
     file[SCORES].attrs["description"] = (
-        "score of each check of flag_legend; NaN where it did not flag the frame, or only when it saw later ones"
+        "score of each check of flag_legend; NaN if the check did not flag the frame, or flagged it only "
+        "after later frames"
     )
     file[REGIONS].attrs["description"] = "first row, row after the last, first column, column after the last; -1: none"
     file[REGIONS].attrs["units"] = "pixel"
     file[VALID].attrs["description"] = "0: a check raised an alarm; the frame's pixels are as the camera gave them"
-    group["bit"].attrs["description"] = "set in flags where the check flagged the frame; alarm_bit: and as an alarm"
+    group["bit"].attrs["description"] = "set in flags if the check flagged the frame; alarm_bit: if it raised an alarm"
     group["unit"].attrs["description"] = "of the check's score"
 
 

@@ -79,7 +79,7 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
     except Exception as error:  # readers of foreign files raise various errors if one is damaged
         raise DataError(f"{path} cannot be read as a Zarr ({type(error).__name__}: {error}).") from error
     if not arrays:
-        raise DataError(f"{path} is not an OME-Zarr image; name an array in it, in `view` as {path.name}::NAME.")
+        raise DataError(f"{path} is not an OME-Zarr image. Name an array in it; in `view` as {path.name}::NAME.")
     finest, *coarser = arrays
     _require_volume(path, finest)
     scales = [finest, *(array for array in coarser if is_halved(finest.shape[-3:], array))]
@@ -94,8 +94,8 @@ def _require_volume(path: Path, array: Any) -> None:
     """DataError for an array that is no volume of real numbers."""
     if array.ndim < 3 or any(n != 1 for n in array.shape[:-3]) or np.dtype(array.dtype).kind not in "uifb":
         raise DataError(
-            f"{path} holds {array.dtype} of shape {array.shape}; expected real numbers [z, y, x], of one time and "
-            "one channel. Copy one to a separate file."
+            f"{path} contains {array.dtype} of shape {array.shape}; expected real numbers [z, y, x] of "
+            "one time and one channel. Copy one time and channel to a separate file."
         )
 
 
@@ -107,7 +107,7 @@ def _require_chunks(path: Path, array: Any) -> None:
     except ValueError as error:
         raise DataError(f"{path} cannot be read as a Zarr ({error}).") from error
     if piece > free_memory():
-        raise DataError(f"{path} has chunks of {piece / 1e9:.3g} GB, more than the memory that is free.")
+        raise DataError(f"{path} has chunks of {piece / 1e9:.3g} GB, which is more than the free memory.")
 
 
 def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:

@@ -88,19 +88,21 @@ def _unopened(
     missing = int(cut[2]) - int(cut[1]) if cut else head.missing if head is not None else 0
     if missing:
         return DataError(
-            f"{path} is cut off: the last {missing} bytes are missing. Copy it again, or use the original. If there is "
-            f"no other, `beamline recover {path}` rescues the frames of a scan of this program. Nothing was read."
+            f"{path} is cut off: the last {missing} bytes are missing. Copy the file again, or use the "
+            f"original. If there is no other copy, `beamline recover {path}` rescues the frames of a scan "
+            "that this program took. Nothing was read."
         )
     if head is not None and head.open_for_writing:
         return DataError(
-            f"{path} is marked as being written. If a scan just begins or ends, or its writer just died, try again in "
-            f"{QUIET:.0f} s. Of a dead writer `h5clear -s {path}` clears the mark. Nothing was read."
+            f"{path} is marked as being written. If a scan is just starting or ending, or its program was "
+            f"just killed, try again in {QUIET:.0f} s. If the program has ended, `h5clear -s {path}` "
+            "clears the mark. Nothing was read."
         )
     if any(lock_failure(error) is LockFailure.HELD for error in problems):
         return DataError(
-            f"{path} is held by another program, which has it open to write (HDF5 got no lock on it). Close it there, "
-            f"or wait until that program has ended. With {WITHOUT} in the environment it is read as it is, perhaps "
-            "half written. Nothing was changed."
+            f"{path} is open for writing in another program (HDF5 could not lock it). Close it there, or "
+            "wait until that program has ended. To read the file anyway, possibly incomplete, set "
+            f"{WITHOUT} in the environment. Nothing was changed."
         )
     return DataError(f"{path} cannot be read as HDF5 ({problems[0]}).")
 
@@ -122,7 +124,7 @@ def _apart(path: Path, head: Superblock | None, follow: bool) -> h5py.File:
     HDF5.
     """
     if head is None or (head.open_for_writing and not head.grows and not abandoned(path)):
-        raise (NotReadyError if follow else DataError)(f"{path} is being created by this program. Try again.")
+        raise (NotReadyError if follow else DataError)(f"This program is still creating {path}. Try again.")
     with readable(path):
         file = h5py.File(GrowingFile(path, head), "r")
         with closed_on_error(file):
@@ -188,9 +190,9 @@ def readable(path: Path) -> Iterator[None]:
     except ALTERED as error:
         if isinstance(error, MemoryError | PermissionError | FileNotFoundError) or _of_our_own(error):
             raise
-        what = " ".join(str(error).split()) or "no more is known"
+        what = " ".join(str(error).split()) or "no further information"
         raise DataError(
-            f"{path} is damaged, or its structure is unexpected ({type(error).__name__}: {what}). Nothing was changed."
+            f"{path} is damaged or has an unexpected structure ({type(error).__name__}: {what}). Nothing was changed."
         ) from error
 
 

@@ -50,7 +50,7 @@ def scan_file(path: str | Path) -> Path:
         return path / JOINED
     if len(parts := files_with_frames(path)) > 1:
         step = next_step(parts[-1]) or f"{to_join(path)}."
-        raise DataError(f"{path} has {len(parts)} parts that are not joined. {step}")
+        raise DataError(f"{path} has {len(parts)} parts that were not joined. {step}")
     return path / SCAN
 
 
@@ -77,16 +77,18 @@ def volume_file(path: Path) -> Path:
     if not (path / SCAN).is_file():
         return _no_run(path, RECON) if path.is_dir() else path
     scan = scan_file(path)
-    make = f"`beamline recon {scan} -o {path / RECON}` makes one."
+    make = f"`beamline recon {scan} -o {path / RECON}` makes it."
     raise DataError(f"{path} has no volume ({RECON}). {next_step(parts_of(path)[-1] / SCAN) or make}")
 
 
 def _no_run(folder: Path, wanted: str) -> Path:
     """The folder, which may hold slices, say. DataError: it is the folder of a run, or of runs."""
     if (folder / EVENTS).is_file():
-        raise DataError(f"{folder} is the folder of a run without a {wanted}: it ended before its first frame.")
+        raise DataError(
+            f"{folder} is the folder of a run without a {wanted}, because the run ended before its first frame."
+        )
     if runs := sorted(log.parent for log in folder.glob(f"*/{EVENTS}")):
-        raise DataError(f"{folder} is a folder of runs: name one of them, such as {runs[-1]}.")
+        raise DataError(f"{folder} contains several runs. Name one of them, such as {runs[-1]}.")
     return folder
 
 
@@ -99,13 +101,14 @@ def next_step(scan: Path) -> str:
     with suppress(DataError, *hdf5.ALTERED), hdf5.open_hdf5(scan) as file:
         if layout.COMMITTED not in file:  # another program writes it, which has no lock that shows whether it lives
             return (
-                f"It is marked as being written, and has not changed for {QUIET:.0f} s or longer. Where the program "
-                f"that wrote it has ended, `h5clear -s {scan}` clears the mark."
+                f"It is marked as being written, but has not changed for {QUIET:.0f} s or longer. If the "
+                f"program that wrote it has ended, `h5clear -s {scan}` clears the mark."
                 if abandoned(scan)
-                else f"Another program still writes it: `beamline recon {scan} --follow` reconstructs it meanwhile."
+                else f"Another program is still writing it: `beamline recon {scan} --follow` reconstructs it "
+                "during the scan."
             )
     if held(scan):
-        return f"Its scan still runs: `beamline recon {scan} --follow` reconstructs it meanwhile."
+        return f"Its scan is still running: `beamline recon {scan} --follow` reconstructs it during the scan."
     return f"{_died(abandoned(scan))}: `beamline recover {scan}` {_MAKES}."
 
 
@@ -116,20 +119,28 @@ def _step_of_run(run: Path) -> str:
     growing = head is not None and head.open_for_writing
     if lives or held(run / EVENTS, exclusively=True) or (growing and held(scan)):
         return (
-            f"Its scan still runs: `beamline watch {run}` shows it, `beamline recon {scan} --follow` reconstructs it "
-            "meanwhile."
+            f"Its scan is still running: `beamline watch {run}` shows it, and `beamline recon {scan} "
+            "--follow` reconstructs it during the scan."
         )
     if not files_with_frames(run):
-        return "It ended before its first frame: start the scan anew."
-    ride, resume = is_ride(run), f"`beamline scan --resume {run}` takes what is missing"
+        return "It ended before its first frame: start the scan again."
+    ride, resume = is_ride(run), f"`beamline scan --resume {run}` takes the missing projections"
     if growing:
         resume = "" if ride else f"{resume}, "
         return f"{_died(lives is False or abandoned(scan))}: {resume}`beamline recover {run}` {_MAKES}."
     if head is not None and _lacks_views(run):
-        return "It ended early, as a ride, which cannot be continued." if ride else f"It ended early: {resume}."
+        return (
+            "It ended early. It recorded the scan of another program, so it cannot be continued."
+            if ride
+            else f"It ended early: {resume}."
+        )
     record = read_record(parts[-1])
     died = record is not None and record.state == DIED
-    return f"Its process died after its scan file was closed: `beamline recover {run}` ends the run." if died else ""
+    return (
+        f"Its process was killed after its scan file was closed: `beamline recover {run}` marks the run as ended."
+        if died
+        else ""
+    )
 
 
 def is_ride(run: Path) -> bool:
@@ -138,12 +149,12 @@ def is_ride(run: Path) -> bool:
     return config.is_file() and "\nride:" in config.read_text(encoding="utf-8", errors="replace")
 
 
-_MAKES = "makes an ordinary file of the frames that are there"
+_MAKES = "makes an ordinary file of the complete frames"
 
 
 def _died(sure: bool) -> str:
     """A sentence on a writer that died; where the disk has no locks, it may still run."""
-    return "Its scan has died" + ("" if sure else ", unless a program still writes to it")
+    return "The process of its scan was killed" + ("" if sure else ", unless a program is still writing to it")
 
 
 def _lacks_views(run: Path) -> bool:

@@ -112,7 +112,7 @@ def join(parts: Sequence[Path], joined: Path) -> int:
     """
     for part in parts:  # HDF5 draws nothing from a file that is marked as being written
         if (head := superblock(part)) is not None and head.open_for_writing:
-            raise DataError(f"{joined} could not be made: {part} was not closed. The parts are untouched.")
+            raise DataError(f"{joined} could not be made, because {part} was not closed. The parts were not changed.")
     with atomic_file(joined, replace=True) as partial, ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         try:
@@ -120,7 +120,9 @@ def join(parts: Sequence[Path], joined: Path) -> int:
                 names = [Path(os.path.relpath(part, joined.parent)).as_posix() for part in parts]
                 return _join(files, names, file)
         except hdf5.ALTERED as error:
-            raise DataError(f"{joined} could not be made ({hdf5.reason(error)}). The parts are untouched.") from error
+            raise DataError(
+                f"{joined} could not be made ({hdf5.reason(error)}). The parts were not changed."
+            ) from error
 
 
 def other_parts(part: Path) -> list[Path]:
@@ -162,7 +164,7 @@ def joined_file_of(part: Path) -> tuple[Path, int] | None:
 
 def to_join(run: Path) -> str:
     """The command that joins the parts of a run, as the end of a sentence."""
-    return f"`beamline recover {run}` joins the parts that are there"
+    return f"`beamline recover {run}` joins the existing parts"
 
 
 def require_joined(file: h5py.File) -> None:
@@ -175,8 +177,8 @@ def require_joined(file: h5py.File) -> None:
     joined = Path(file.filename)
     if why := _disagreement(file, joined.parent):
         raise DataError(
-            f"{joined} does not have the frames of its scan: {why}. {to_join(joined.parent)}; where parts are "
-            "elsewhere, copy the folder of the run as a whole. Nothing was changed."
+            f"{joined} does not have all frames of its scan: {why}. {to_join(joined.parent)}. If parts "
+            "are in another place, copy the whole folder of the run. Nothing was changed."
         )
 
 
@@ -190,18 +192,20 @@ def is_joined(joined: Path) -> bool:
 
 def _disagreement(joined: h5py.File, folder: Path) -> str:
     if layout.PARTS not in joined:
-        return "it does not say what its parts are"
+        return "it does not list its parts"
     names, frames = (joined[f"{layout.PARTS}/{column}"][()] for column in ("name", "frames"))
     parts = [folder / datasets.text(name) for name in names]
     for part, n in zip(parts, frames, strict=True):
         if not part.is_file():
-            return f"its part {part} is not there"
+            return f"its part {part} does not exist"
         with hdf5.open_hdf5(part) as file, hdf5.readable(part):
             committed = int(file[layout.COMMITTED][()])
             if committed != n:
-                return f"its part {part} has {committed} frames, not the {n} which it was made of"
+                return (
+                    f"its part {part} has {committed} frames instead of the {n} that it had when the parts were joined"
+                )
     others = [other for other in other_parts(parts[0]) if other not in [part.resolve() for part in parts]]
-    return f"it lacks those of {others[0]}" if others else ""
+    return f"the frames of {others[0]} are missing" if others else ""
 
 
 def _join(files: Sequence[h5py.File], names: Sequence[str], joined: h5py.File) -> int:

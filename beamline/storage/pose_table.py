@@ -37,7 +37,9 @@ _VECTORS = {
 _ARRAYS = {"parallel3d_vec": False, "cone_vec": True}  # arrays of vectors, and whether they are of a cone
 _STEEPEST = 85.0  # degrees of tilt
 _LARGEST = 64 * 2**20  # bytes of a CSV
-_HOW = "say which way: --poses FILE:x,-y means that columns grow with x_translation and rows against y_translation"
+_HOW = (
+    "state the directions: --poses FILE:x,-y means that columns grow with x_translation and rows against y_translation"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +131,9 @@ def _of_csv(path: Path, content: str) -> PoseTable:
     cone = next((cone for cone, columns in _VECTORS.items() if columns[0] in names), None)
     if lines and len(re.split(r"[\s,]+", lines[0].strip())) == 12 and not re.search("[a-df-z]", lines[0]):
         raise ValueError(
-            f"{path} has 12 numbers a line and no names, as vectors of ASTRA. Save them with the name of their kind, "
-            f"cone_vec or parallel3d_vec: python -c \"import numpy as np; np.savez('poses.npz', cone_vec=np.loadtxt("
-            f"'{path.name}'))\", and give --poses poses.npz"
+            f"{path} has 12 numbers per line and no names, like vectors of ASTRA. Save them under the "
+            'name of their kind, cone_vec or parallel3d_vec: python -c "import numpy as np; '
+            f"np.savez('poses.npz', cone_vec=np.loadtxt('{path.name}'))\", and give --poses poses.npz"
         )
     _require_header(path, names, cone)
     columns = dict(zip(names, _numbers(path, names, rows).T, strict=True))
@@ -152,19 +154,19 @@ def _require_header(path: Path, names: list[str], cone: bool | None) -> None:
     missing = set(stated) - set(names)
     if not set(names) & set(_KEYS) or (len(missing) == len(stated) if cone is None else missing):
         raise ValueError(
-            f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or angle_deg and with "
-            f"{'some' if cone is None else 'all'} of {', '.join(stated)}"
+            f"{path}: the first line is {','.join(names)!r}; expected a header with view, frame or "
+            f"angle_deg, and with {'some' if cone is None else 'all'} of {', '.join(stated)}"
         )
     legal = (*_KEYS, *stated, *(_FOR_PEOPLE if cone is None else ()))
     for name in names:
         if name not in legal or names.count(name) > 1:
-            raise ValueError(f"{path}: column {name!r} is unknown or there twice; known: {', '.join(legal)}")
+            raise ValueError(f"{path}: column {name!r} is unknown or occurs twice; known: {', '.join(legal)}")
 
 
 def _numbers(path: Path, names: list[str], rows: list[list[str]]) -> F64:
     """The table [row, column]; ValueError for cells that are no numbers, and without a row."""
     if not rows:
-        raise ValueError(f"{path} has a header and no rows; expected one for each view")
+        raise ValueError(f"{path} has a header and no rows; expected one row for each projection")
     values = np.empty((len(rows), len(names)))
     for number, row in enumerate(rows):
         try:
@@ -180,7 +182,7 @@ def _require_keys(path: Path, columns: dict[str, F64], by: Key) -> None:
         given = columns[name]
         bad = ~np.isfinite(given) | ((name != "angle_deg") & (given != np.abs(np.round(given))))
         if bad.any():
-            kind = "finite angles" if name == "angle_deg" else "whole numbers from 0 on"
+            kind = "finite angles" if name == "angle_deg" else "integers from 0 on"
             raise ValueError(f"{path}: {name} holds {given[bad][:3].tolist()}; expected {kind}")
 
 
@@ -190,7 +192,7 @@ def _of_arrays(path: Path) -> PoseTable:
         arrays = numpy_arrays(path)
     read = {name: values for name, values in arrays.items() if name in _ARRAYS}
     if len(read) != 1:
-        raise ValueError(f"{path} holds {', '.join(arrays)}; expected one of {' and '.join(_ARRAYS)}")
+        raise ValueError(f"{path} contains {', '.join(arrays)}; expected one of {' and '.join(_ARRAYS)}")
     ((name, vectors),) = read.items()
     if vectors.dtype.kind not in "iuf" or vectors.ndim != 2:
         raise ValueError(f"{path}: {name} is {vectors.dtype} of shape {vectors.shape}; expected numbers [view, 12]")
@@ -221,9 +223,11 @@ def _of_volume(path: Path, record: ReconRecord) -> PoseTable:
         np.atleast_1d(np.asarray(parameters.get(name, ()), np.float64)) for name in ("view_frames", "view_angles_deg")
     )
     if not any(name in parameters for name in POSES_KEPT) or not frames.size:
-        raise ValueError(f"{path} holds no poses: its views were taken as straight and not displaced")
+        raise ValueError(f"{path} contains no poses: its projections were used as not displaced and not tilted")
     if CENTRES_KEPT in parameters:
-        raise ValueError(f"{path} was made with vectors of each view, but does not hold them: give their file")
+        raise ValueError(
+            f"{path} was made with vectors of each projection, but does not contain them: give the file of the vectors"
+        )
     none, binning = np.zeros(frames.size), int(parameters.get("binning", 1))
     shifts = np.asarray(parameters.get("view_shifts_px", np.zeros((frames.size, 2))), np.float64) * binning
     turns = np.stack([np.asarray(parameters.get(name, none), np.float64) for name in POSES_KEPT[1:]], axis=1)
@@ -264,7 +268,8 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
         moved[axis] = values - np.median(values[shown])
     if not moved:
         raise _NoPosesError(
-            f"{path} has no sample/x_translation, y_translation or z_translation; expected some, or a CSV"
+            f"{path} has none of sample/x_translation, y_translation and z_translation; expected at least "
+            "one of them, or a CSV"
         )
     directions = ", ".join(f"{axis} by {np.ptp(values[shown]):.4g} mm" for axis, values in moved.items())
     if ways is None:

@@ -87,8 +87,9 @@ def no_locks_sentence(place: Path, number: int | None = None) -> str:
     """A sentence with the cause and the remedy."""
     told = "" if number is None else f" (errno {number})"
     return (
-        f"the file system of {place} has no file locks{told}, as NFS is often mounted, and HDF5 creates no file there; "
-        f"choose a storage.folder on a local disk, have it mounted with locks, or set {WITHOUT} in the environment"
+        f"the file system of {place} has no file locks{told}, which is often so with NFS, and HDF5 "
+        "creates no file there. Choose a storage.folder on a local disk, mount the file system with "
+        f"locks, or set {WITHOUT} in the environment"
     )
 
 
@@ -192,5 +193,5 @@ class WriterWatch:
         if grew or (self._held and now - self._last_frame > self._patience):
             self._last_frame = now
         if self._was_held and not self._held and not finished():
-            return "has lost its writer"
+            return "is no longer being written, because its program ended"
         return f"has not grown for {self._patience:.0f} s" if now - self._last_frame > self._patience else ""

@@ -52,8 +52,8 @@ class AveragedSource(Frames):
         if base.finished and not any(len(group) > 1 for group in self._groups):
             views = base.table.views.size
             raise ConfigError(
-                f"--frames-per-view {n}: no two of the {views} projections of {base.path} that follow one another are "
-                "closer in angle than views are. Leave it out. Nothing was read."
+                f"Omit --frames-per-view {n}: no two consecutive projections of the {views} in "
+                f"{base.path} are at the same angle, so there is nothing to average. Nothing was read."
             )
 
     def _update(self) -> None:

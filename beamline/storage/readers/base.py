@@ -172,7 +172,7 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
     if indices.size == 0:
         return np.empty(0, np.int64)
     if indices.ndim != 1 or indices.dtype.kind not in "ui":
-        raise IndexError(f"Frames are chosen by a slice or whole numbers, not by {indices.dtype} {indices.shape}.")
+        raise IndexError(f"Frames are chosen by a slice or by integers, but {indices.dtype} {indices.shape} was given.")
     indices = indices.astype(np.int64)
     if indices.min() < -n or indices.max() >= n:
         raise IndexError(f"Frames {indices.min()}..{indices.max()} were requested, but only 0..{n - 1} can be read.")

@@ -36,7 +36,7 @@ from beamline.storage.readers.orders import (
 from beamline.storage.readers.stacks import FrameStack, StacksSource
 from drivers.base.frame import FrameKind
 
-_UNKNOWN = "the names are unknown; theta:y:x is taken"
+_UNKNOWN = "the names are unknown; theta:y:x is assumed"
 _DETECTOR = "measurement/instrument/detector"
 _FLATS = "process/acquisition/flat_fields"
 _ANY = {"": 1.0, "x": 1.0, "1": 1.0, "dimensionless": 1.0, "pixel": 1.0}  # of a number without a unit
@@ -229,7 +229,9 @@ def _measured(
     if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
     source.not_used += (
-        NotUsed(where, datasets.text_of(item), "it has no attribute `units`, and in the SI's it cannot be", True),
+        NotUsed(
+            where, datasets.text_of(item), "it has no attribute `units`, and in SI units the value is impossible", True
+        ),
     )
     return None
 
@@ -247,13 +249,14 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
         if start is not None and step and abs(step) <= math.pi:
             return start + step * np.arange(n_views, dtype=np.float64)
         raise DataError(
-            f"{file.filename} has no /exchange/theta, and neither /process/acquisition/rotation nor attributes of "
-            "/exchange state one start and one step of the rotation, of 180 degrees at most. Some readers then assume "
-            "0 to 180 degrees; we do not: give them with --angles FILE (degrees, one a line)."
+            f"Give the angles with --angles FILE (degrees, one per line): {file.filename} has no "
+            "/exchange/theta, and neither /process/acquisition/rotation nor attributes of /exchange "
+            "state one start and one step of the rotation of at most 180 degrees. Some programs assume 0 "
+            "to 180 degrees in this case; this one does not."
         )
     angles = datasets.radians(theta, default="degrees")
     if all_there and (angles.size != n_views or n_views not in (1, *theta.shape)):
-        way = f" If the scan ended early, give its first: --angles-path /exchange/theta --angle-rows 0:{n_views}"
+        way = f" If the scan ended early, use the first angles: --angles-path /exchange/theta --angle-rows 0:{n_views}"
         raise DataError(
             f"{file.filename}: /exchange/theta has {angles.size} angles for {n_views} projections, shape "
             f"{theta.shape}; expected one angle for each.{way if angles.size > n_views else ''}"

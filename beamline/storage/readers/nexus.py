@@ -64,7 +64,7 @@ def find(file: h5py.File) -> list[Places]:
                 if key is not None and data is not None and data.ndim == 3:
                     places.append(Places(entry, detector, data, key, *_find_angle(entry, detector, len(data))))
     if unresolved and not places:
-        raise DataError(f"{file.filename} has no frames: {unresolved[0]}. Put the linked file back beside this one.")
+        raise DataError(f"{file.filename} has no frames: {unresolved[0]}. Put the linked file back next to this one.")
     return places
 
 
@@ -92,7 +92,7 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.D
     name = datasets.attribute(data, "axes") if isinstance(data, h5py.Group) else ""  # the first of the axes
     if isinstance(data, h5py.Group) and name and data.get(name, getlink=True) is not None:
         angle = datasets.dataset(data, name)
-        return angle, "" if angle is not None else f"{_link(data, name)} is not there", 1
+        return angle, "" if angle is not None else f"{_link(data, name)} does not exist", 1
     rotations = _rotations_of_sample(entry)
     if len(rotations) == 1:
         return rotations[0][0], "", rotations[0][1]
@@ -101,7 +101,7 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.D
     lists = [item for item in datasets.arrays_in(entry.file, (1,)) if item.size == n]
     units = ((item, datasets.factor_of(datasets.attribute(item, "units"), datasets.ANGLE_UNITS)) for item in lists)
     names = [str(item.name) for item, known in units if known is not None]
-    which = f"; {', '.join(names[:_LISTED])} may be the angles: --angles-path {names[0]} takes them" if names else ""
+    which = f"; {', '.join(names[:_LISTED])} may be the angles: --angles-path {names[0]} uses them" if names else ""
     return None, f"{entry.name} has no sample/rotation_angle{which}", 1
 
 
@@ -148,8 +148,8 @@ def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Pla
             return some[0]
     names = ", ".join(f"{places.data.name} ({' x '.join(map(str, places.data.shape))})" for places in found[:_LISTED])
     raise DataError(
-        f"{file.filename} has several detectors with frames, and no attribute `default` names one of them: {names}. "
-        f"Say which: --data-path {found[0].data.name}."
+        f"{file.filename} has several detectors with frames, and no attribute `default` names one of "
+        f"them: {names}. Choose one: --data-path {found[0].data.name}."
     )
 
 
@@ -207,7 +207,7 @@ def read_geometry(places: Places) -> NexusGeometry:
         pixels = [theirs * sdd / sod if theirs else ours for theirs, ours in zip(at_sample, own, strict=True)]
     mirrored, turned = _mirrored(detector)
     if how := [name for name, is_so in zip(("upside down", "left to right"), mirrored, strict=True) if is_so]:
-        remarks["flipped"] = f"{' and '.join(how)}: frames are mirrored back as they are read"
+        remarks["flipped"] = f"{' and '.join(how)}: frames are mirrored back when they are read"
     beside = [own[0] or pixels[0], own[1] or pixels[1] or own[0]]
     row, col = (_central(places, i, beside[i], mirrored[1 - i]) for i in (1, 0))
     return NexusGeometry((pixels[0], pixels[1]), cone, (row, col), mirrored, turned, remarks)
@@ -234,16 +234,20 @@ def _cone_of(
     sod, sdd = abs(upstream), abs(upstream) + beyond
     if not (sod > 0 and beyond >= 0):
         raise DataError(
-            f"{places.entry.file.filename}: the source is {upstream:g} mm from the sample and the detector {beyond:g} "
-            "mm behind it; expected distances of the source that are not 0, and of the detector from 0 on. Correct "
-            "them in a copy of the file."
+            f"{places.entry.file.filename}: the source is {upstream:g} mm from the sample and the "
+            f"detector {beyond:g} mm behind it; expected a source distance other than 0 and a detector "
+            "distance of 0 or more. Correct them in a copy of the file."
         )
     width, cols = at_sample or (None if own is None else own * sod / sdd), places.data.shape[2]
     diverged = None if width is None else width * cols / 2 / sod * cols / 2
     if sdd / sod > 1 + _MAGNIFIED or (diverged is not None and diverged > _DIVERGED):
         return (sod, sdd), {}
-    by = "" if diverged is None else f", and rays leave their parallels by {diverged:.2g} px in the field"
-    return None, {"source_distance": f"{sod:g} mm: a parallel beam (magnification {sdd / sod:.4f}{by})"}
+    by = (
+        ""
+        if diverged is None
+        else f", and rays deviate from parallel ones by {diverged:.2g} px within the field of view"
+    )
+    return None, {"source_distance": f"{sod:g} mm, treated as a parallel beam (magnification {sdd / sod:.4f}{by})"}
 
 
 def differing(height: float | None, width: float | None) -> float | None:
@@ -262,9 +266,9 @@ def require_order(places: Places) -> None:
         ]
         if order_of_axes(axes) not in (None, (0, 1, 2)):
             raise DataError(
-                f"{nxdata.name} in {places.entry.file.filename} says that its axes are {', '.join(axes)}; expected "
-                "frames [frame, row, col]: the rotation angle, then y, then x. Turn the frames in a copy of the file, "
-                "or correct the attribute `axes`."
+                f"{nxdata.name} in {places.entry.file.filename} states the axes {', '.join(axes)}; "
+                "expected frames [frame, row, col]: the rotation angle, then y, then x. Reorder the "
+                "frames in a copy of the file, or correct the attribute `axes`."
             )
 
 

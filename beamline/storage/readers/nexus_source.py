@@ -109,7 +109,7 @@ class NexusSource(ScanSource):
         lost = datasets.missing_links(self._places.data) + datasets.missing_links(self._places.keys)
         if lost:
             raise DataError(
-                f"{self.path} draws its frames from {lost[0]}, which is not there or differs ({len(lost)} such)."
+                f"{self.path} refers to frames in {lost[0]}, which does not exist or differs ({len(lost)} such)."
             )
 
     @property
@@ -188,7 +188,7 @@ class NexusSource(ScanSource):
         self.not_used += stated_in(NXTOMO, self._places.entry, self, str(self._places.detector.name))
         for other in {str(each.data.name): each for each in found if each.data != self._places.data}.values():
             shape, where = " x ".join(map(str, other.data.shape)), str(other.data.name)
-            why = f"it is another scan of this file: --data-path {where}"
+            why = f"it is another scan in this file; --data-path {where} selects it"
             self.not_used += (NotUsed(where, f"{shape} frames", why, True),)
         if turned:
             self.not_used += (NotUsed("detector/transformations", turned, UPRIGHT, True),)

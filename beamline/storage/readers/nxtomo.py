@@ -45,8 +45,9 @@ class OwnScan(NexusSource):
             return None
         if sod <= 0 or beyond < 0:
             raise DataError(
-                f"{self.path}: the source is {sod:g} mm before the sample and the detector {beyond:g} mm behind it; "
-                "expected a positive distance of the source. Correct it in a copy of the file."
+                f"{self.path}: the source is {sod:g} mm in front of the sample and the detector "
+                f"{beyond:g} mm behind it; expected a source distance above 0. Correct it in a copy of "
+                "the file."
             )
         return sod, sod + beyond
 
@@ -72,7 +73,7 @@ class OwnScan(NexusSource):
         hdf5.look_again(committed)
         n = int(committed[()])
         if n < 0:
-            raise ValueError(f"{n} frames are committed")
+            raise ValueError(f"{n} frames are marked as complete")
         if n > self.n:  # those that are open here: HDF5 2.0 reads wrong values if another handle refreshes them
             for item in {self._places.data, self._places.image_key, self._places.angle} - {None}:
                 hdf5.look_again(item)

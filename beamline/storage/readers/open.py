@@ -163,7 +163,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         side = side_of(base) if options.side_file is None else None
         if side is None:
             raise
-        raise DataError(f"{error} Beside it lies {side.path.name}: {side.option} takes it ({side}).") from error
+        raise DataError(f"{error} {side.path.name} lies next to it: {side.option} uses it ({side}).") from error
     except BaseException:
         base.close()
         raise
@@ -270,7 +270,7 @@ def _angle_table(
         table = parse_angles(base.angle_text[1], origin)
     if options.angle_rows is not None:
         if table is None:
-            raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from: give --angles FILE.")
+            raise DataError(f"--angle-rows {options.angle_rows} needs angles to choose from; give --angles FILE.")
         table = select_rows(table, options.angle_rows)
     return table, origin
 
@@ -328,8 +328,8 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         raise DataError(no_image(path, [path.name]))
     if not hdf5.is_hdf5(path):
         raise DataError(
-            f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr; a scan is one of these, or a "
-            f"folder or .zip of one or more images.{_WAYS.get(path.suffix.lower(), '')}"
+            f"{path} is neither HDF5 nor TIFF nor PNG, nor a .txrm, .npy, .npz or Zarr. A scan must be "
+            f"one of these, or a folder or .zip of images.{_WAYS.get(path.suffix.lower(), '')}"
         )
     known = ", ".join(kind.name for kind in FORMATS)
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):
@@ -338,16 +338,16 @@ def _open(path: Path, opening: Opening) -> ScanSource:
         with opened_reconstruction(path) as record:
             made_by = record.method or "another program"
         raise DataError(
-            f"{path} is a volume, made by {made_by}, not a scan: `beamline view {path}` shows it, and `beamline "
-            "export` writes it in another format."
+            f"{path} is a volume made by {made_by}, not a scan. `beamline view {path}` shows it, and "
+            "`beamline export` writes it in another format."
         )
     raise DataError(
-        f"{path} holds no scan of a format that is read: {known}. {held} Name those of the scan: --data-path, "
-        "--angles-path, --darks-path, --flats-path."
+        f"{path} contains no scan in a known format: {known}. {held} Name the datasets of the scan: "
+        "--data-path, --angles-path, --darks-path, --flats-path."
     )
 
 
-_VOLUME = " It may be a volume: `beamline view` shows those of NIfTI."
+_VOLUME = " It may be a volume: `beamline view` shows NIfTI volumes."
 _WAYS = {".mat": " Save a .mat with -v7.3.", ".nii": _VOLUME, ".gz": _VOLUME}
 
 
@@ -366,13 +366,13 @@ def _refuse(options: SourceOptions, follow: bool) -> None:
     if follow and replaced:
         raise DataError(
             f"{options.path} cannot be followed with {', '.join(replaced)}: what replaces its data must fit all "
-            "frames, and more are still to come."
+            "frames, and more frames will arrive."
         )
     for one, other in (("angles", "angles_path"), ("darks", "darks_path"), ("flats", "flats_path")):
         if getattr(options, one) is not None and getattr(options, other) is not None:
-            raise DataError(f"--{one} and --{other.replace('_', '-')} name the same thing twice: give one of them.")
+            raise DataError(f"--{one} and --{other.replace('_', '-')} state the same thing. Give only one of them.")
     for name, needed in (("darks_path", "data_path"), ("flats_path", "data_path"), ("angles_unit", "angles_path")):
         of_angles = name == "angles_unit" and isinstance(options.angles, Path | str)
         if getattr(options, name) is not None and getattr(options, needed) is None and not of_angles:
             dashed = (f"--{each.replace('_', '-')}" for each in (name, needed))
-            raise DataError("{} goes with {}: give both, or neither.".format(*dashed))
+            raise DataError("{} requires {}: give both, or neither.".format(*dashed))

@@ -111,8 +111,8 @@ def stated_order(names: str) -> Order:
     """The order that a caller states, as in "row,view,col". DataError for another text."""
     if (order := order_of_axes(names.split(","))) is None:
         raise DataError(
-            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or view,col of "
-            "a sinogram."
+            f"The dimensions are given as {names}; expected those of the array, such as frame,row,col, or "
+            "view,col for a sinogram."
         )
     return order
 
@@ -156,16 +156,17 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
         return base
     if order is None and len(fits) > 1:
         raise DataError(
-            f"{base.path} holds one image of {n_angles} x {n_angles} pixels, a sinogram by its {n_angles} angles: "
-            "whether its rows or its columns are the views is not known. Give --order view,col or --order col,view."
+            f"Give --order view,col or --order col,view: {base.path} is one image of {n_angles} x "
+            f"{n_angles} pixels. Because there are {n_angles} angles it is a sinogram, but either its "
+            "rows or its columns may be the projections."
         )
     order = order or ("col,view" if max(sizes[: fits[0]]) > 1 else "view,col")
     images = as_frames(_ImageStack(base), places := stated_order(order))
     if not isinstance(images, TurnedFrames) or not alike:
         raise DataError(
             f"--order {order} does not fit {base.path}, {len(base.table)} images of {base.shape[0]} x "
-            f"{base.shape[1]} pixels. It names each dimension, and all images must be of the sample: give darks and "
-            "flats with --darks and --flats."
+            f"{base.shape[1]} pixels. It must name each dimension, and all images must show the sample: "
+            "give darks and flats with --darks and --flats."
         )
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:

@@ -64,13 +64,14 @@ def stated_references(
         return nothing if darks is None else darks, flats
     if darks is not None or flats is not None:
         raise DataError(
-            "--quantity transmission means that frames are already divided by flats: leave out --darks and --flats."
+            "Omit --darks and --flats, because --quantity transmission means that the frames were "
+            "already divided by flats."
         )
     if base.dtype.kind != "f":
         raise DataError(
-            f"{base.path} holds {base.dtype} pixels; transmission is a real number from 0 to 1. Where a whole number "
-            "stands for 1, such as 65535, or the counts of air beside the sample, give it: --flats 65535 --darks 0, "
-            "without --quantity."
+            f"{base.path} has {base.dtype} pixels, but transmission is a real number from 0 to 1. If an "
+            "integer such as 65535, or the counts of air next to the sample, represents a transmission "
+            "of 1, give it without --quantity: --flats 65535 --darks 0."
         )
     return nothing, np.ones_like(nothing)
 
@@ -111,7 +112,7 @@ def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None =
         with hdf5.open_hdf5(path) as file, hdf5.readable(path):
             return _in_rows(_of_hdf5(path, file, dataset.replace("\\", "/"), kind, shape), shape)
     if dataset:
-        raise DataError(f"{path} is not an HDF5 file, so that it has no dataset {dataset}.")
+        raise DataError(f"{path} is not an HDF5 file, so it has no dataset {dataset}.")
     return _in_rows(_of_images(path), shape)
 
 
@@ -136,7 +137,7 @@ def _of_images(path: Path) -> NDArray[Any]:
         parts = [decoder(file) for decoder, file in zip(decoders, files, strict=True)]
         stack = np.concatenate([part[None] if part.ndim == 2 else part for part in parts])
     except UNREADABLE as error:
-        wanted = "" if isinstance(error, OSError) and error.errno else " as images of one shape, nor as HDF5"
+        wanted = "" if isinstance(error, OSError) and error.errno else " as images of one shape or as HDF5"
         raise DataError(f"The reference frames in {path} cannot be read{wanted} ({hdf5.reason(error)}).") from error
     return _stack(stack, str(path), untyped)
 
@@ -162,8 +163,8 @@ def _of_hdf5(path: Path, file: h5py.File, dataset: str, kind: FrameKind, shape: 
     wanted = "images" if shape is None else f"images of {shape[0]} x {shape[1]} pixels"
     option = f"--{kind.name.lower()}s"
     if candidates:
-        raise DataError(f"{path} holds several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
-    raise DataError(f"{path} holds no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
+        raise DataError(f"{path} contains several datasets of {wanted}: {shapes}. Name one: {option} FILE::DATASET.")
+    raise DataError(f"{path} contains no {wanted} for {option}" + (f"; it has {shapes}." if shapes else "."))
 
 
 def _of_scan(source: ScanSource, kind: FrameKind) -> NDArray[Any]:
@@ -200,7 +201,7 @@ def _images(file: h5py.File) -> Iterator[h5py.Dataset]:
 
 def _read(path: Path, item: Any) -> NDArray[Any]:
     if lost := datasets.missing_links(item):
-        raise DataError(f"{path} draws {item.name} from {lost[0]}, which is not there or differs.")
+        raise DataError(f"{path} refers to data of {item.name} in {lost[0]}, which does not exist or differs.")
     frames = as_frames(item)
     if frames.ndim != 3:
         raise DataError(f"{item.name} in {path} is {item.shape}; expected images [frame, row, col].")

@@ -136,7 +136,7 @@ def with_side_file(base: ScanSource, side: SideFile) -> ScanSource:
     """
     views = base.table.views.size
     if views != side.count:
-        raise DataError(f"{side.path} describes {side.count} projections; {base.path} has {views}.")
+        raise DataError(f"{side.path} describes {side.count} projections, but {base.path} has {views}.")
     return Frames(
         base,
         cone=side.cone,
@@ -157,12 +157,12 @@ def read_side_file(path: Path) -> SideFile:
         values = _values(path)
     except (OSError, ValueError, configparser.Error, ElementTree.ParseError, RecursionError) as error:
         why = getattr(error, "strerror", None) or error
-        raise DataError(f"{path} cannot be read as a file of a CT scanner ({why}).") from error
+        raise DataError(f"{path} cannot be read as a settings file of a CT scanner ({why}).") from error
     for keys in MAKERS:
         if keys.suffix == path.suffix.lower() and keys.sod in values:
             return _side_file(path, keys, values)
     known = ", ".join(f"{keys.maker} {keys.suffix}" for keys in MAKERS)
-    raise DataError(f"{path} is not a supported file of a CT scanner ({known}).")
+    raise DataError(f"{path} is not a supported settings file of a CT scanner ({known}).")
 
 
 def side_of(source: ScanSource) -> SideFile | None:
@@ -188,7 +188,7 @@ def reconstructed_pixel_mm(log: Path) -> float | None:
 def offered(source: ScanSource) -> tuple[NotUsed, ...]:
     """A sentence on what a vendor's file beside these images states."""
     side = side_of(source)
-    return () if side is None else (NotUsed(side.path.name, str(side), f"{side.option} takes it", True),)
+    return () if side is None else (NotUsed(side.path.name, str(side), f"{side.option} uses it", True),)
 
 
 def _candidates(scan: Path) -> Iterator[Path]:
@@ -205,7 +205,7 @@ def _values(path: Path) -> dict[str, str]:
     text, values = _text(path), dict[str, str]()
     if path.suffix.lower() == ".xml":
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise ValueError("it defines entities")
+            raise ValueError("it defines XML entities, which are not read")
         _of_element(ElementTree.fromstring(text), "", values)
     elif text.lstrip().startswith("{"):
         _of_json(json.loads(text), "", values)
@@ -260,7 +260,7 @@ _LARGEST = 1e7  # of these numbers: no scan has as many projections, and no dist
 def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFile:
     number = _numbers(path, keys, values)
     if other := next((key for key in keys.helix if values.get(key, "").lower() == "true"), ""):
-        raise DataError(f"{path} says {other}: only scans on a circle are supported.")
+        raise DataError(f"{path} states {other}: only scans on a circle are supported.")
     sod, sdd, pixel, count = (number[name] or 0.0 for name in _NEEDED)
     if lacking := [getattr(keys, name) for name in _NEEDED if not 0 < (number[name] or 0) < _LARGEST]:
         raise DataError(f"{path} states no {', '.join(lacking)}; expected positive numbers below {_LARGEST:g}.")

@@ -93,17 +93,18 @@ class StacksSource(ScanSource):
             if stack.frames.ndim != 3 or stack.frames.shape[1:] != views.frames.shape[1:]:
                 shapes = ", ".join(f"{part.name} {part.frames.shape}" for part in self._stacks)
                 raise DataError(
-                    f"{self.path}: expected frames [frame, row, col] of one shape, beside dimensions of length one; "
-                    f"found {shapes}. --order view,row,col says another order of dimensions."
+                    f"{self.path}: expected frames [frame, row, col] of one shape, apart from dimensions "
+                    f"of length one; found {shapes}. --order view,row,col states another order of "
+                    "dimensions."
                 )
             item = stack.frames.item if isinstance(stack.frames, TurnedFrames) else stack.frames
             if isinstance(item, h5py.Dataset | NamedArray):
                 self.unpack_bytes = max(self.unpack_bytes, datasets.require_possible(stack.frames))
                 if lost := datasets.missing_links(item):
-                    raise DataError(f"{self.path} draws its frames from {lost[0]}, which is not there or differs.")
+                    raise DataError(f"{self.path} refers to frames in {lost[0]}, which does not exist or differs.")
         if not len(views.frames):
             none = DataError if self.finished else hdf5.NotReadyError
-            raise none(f"{self.path} holds no projections: {views.name} has shape {views.frames.shape}.")
+            raise none(f"{self.path} contains no projections: {views.name} has shape {views.frames.shape}.")
 
     def read(self, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
         """Pixels [frame, row, col] of the requested frames, in that order; darks and flats are cast to dtype."""
@@ -159,7 +160,7 @@ def open_stacks(
         source = StacksSource(path, file, stacks, format="hdf5_stacks" if stored else "arrays", facts=facts)
         lists = [item.name for item in arrays_of(file) if item.ndim == 1 and item.size == len(stacks[-1].frames)]
         if lists and angles is None:
-            source.facts = {**facts, "angles": f"--angles-path {lists[0]} takes those of {', '.join(lists[:_LISTED])}"}
+            source.facts = {**facts, "angles": f"--angles-path {lists[0]} uses those of {', '.join(lists[:_LISTED])}"}
         if isinstance(file, ArrayFile) and angles is None:
             _take_angles(source, [file[name] for name in lists if _ANGLES.search(name)])
         _take_geometry(source, views)
@@ -247,8 +248,8 @@ def _only_images(file: ArrayFile) -> str:
     images = [name for name, item in file.items() if item.ndim > 1]
     if len(images) != 1:
         raise DataError(
-            f"{file.filename} holds {len(images)} arrays that may be images. {datasets_text(file)} Name those of the "
-            "scan: --data-path, --angles-path, --darks-path, --flats-path."
+            f"{file.filename} contains {len(images)} arrays that may be images. {datasets_text(file)} "
+            "Name those of the scan: --data-path, --angles-path, --darks-path, --flats-path."
         )
     return images[0]
 

@@ -101,12 +101,14 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
     Raises:
         DataError: its OME metadata say that pages go along several axes, which of them the views are is not known.
     """
-    listed, why = 0, "frames are the images of full resolution in this file"
+    listed, why = 0, "the full-resolution images of this file are used as frames"
     for pixels in re.findall(r"<Pixels\b[^>]*>", tif.pages.first.description):
         sizes = {axis: int(n) for axis, n in re.findall(r'\bSize([CZT])="(\d+)"', pixels) if int(n) > 1}
         listed += math.prod(sizes.values())
         if len(sizes) > 1:
-            raise DataError(f"{path} holds images along several axes (OME: {sizes}). Save the views alone, along one.")
+            raise DataError(
+                f"{path} contains images along several axes (OME: {sizes}). Save only the projections, along one axis."
+            )
     copies = sum(len(part.levels) for part in tif.series) - len(images_of(tif))
     notes = [("pages of other resolutions or masks", copies, False)] if copies else []
     if path.suffix.lower() in SUFFIXES and listed > len(tif.pages):
@@ -153,12 +155,13 @@ def no_image(path: Path, names: Sequence[str]) -> str:
     """A sentence on a folder without images that can be read, or on a picture of a kind that is not read."""
     foreign = next((name for name in names if name.lower().endswith(FOREIGN)), None)
     if foreign is None:
-        return f"{path} holds no image: no .tif, .tiff, .npy or .png file."
+        return f"{path} contains no image: no .tif, .tiff, .npy or .png file."
     return (
-        f"{path}: pictures such as {foreign} are not read: their 8 bits, or what their compression leaves out, spoil "
-        "line integrals. Export 16-bit TIFF or PNG from the program that has the frames. Where there is "
-        "nothing else, in the folder: python -c \"from PIL import Image; import glob; [Image.open(n).convert('L')"
-        f".save(n + '.png') for n in glob.glob('*{foreign[foreign.rfind('.') :]}')]\" writes PNG, which is read."
+        f"Export 16-bit TIFF or PNG from the program that has the frames: in {path}, pictures such as "
+        f"{foreign} are not read, because 8 bits or lossy compression make line integrals wrong. If there "
+        'are no other images, convert them to PNG in the folder: python -c "from PIL import Image; '
+        "import glob; [Image.open(n).convert('L').save(n + '.png') for n in "
+        f"glob.glob('*{foreign[foreign.rfind('.') :]}')]\"."
     )
 
 
@@ -185,7 +188,7 @@ def require_possible(tif: tifffile.TiffFile, most: float = math.inf) -> None:
     first, stored = tif.pages.first, tif.filehandle.size
     claimed = first.nbytes * len(tif.pages)
     if not first.nbytes or claimed > min(most, PACKED * stored) or is_blank(claimed, stored, first.nbytes):
-        raise ValueError(f"it claims {claimed / 1e9:.3g} GB in {stored} bytes")
+        raise ValueError(f"its header states {claimed / 1e9:.3g} GB, but the file has {stored} bytes")
 
 
 def refuse_packed(tif: tifffile.TiffFile) -> None:
@@ -193,8 +196,8 @@ def refuse_packed(tif: tifffile.TiffFile) -> None:
     bits = tif.pages.first.bitspersample
     if bits > 8 and bits not in (16, 32, 64) and find_spec("imagecodecs") is None:
         raise ValueError(
-            f"its pixels are packed, {bits} bits each: pip install imagecodecs, which unpacks them, or write the "
-            "images with 16 bits a pixel"
+            f"its pixels are packed with {bits} bits each: pip install imagecodecs, which unpacks them, "
+            "or write the images with 16 bits per pixel"
         )
 
 
@@ -202,5 +205,6 @@ def refuse_volume(path: Path, tif: tifffile.TiffFile) -> None:
     """Raise DataError for slices of a volume that this program wrote."""
     if VOLUME in tif.pages.first.description:
         raise DataError(
-            f"{path} is a volume that this program wrote, not a scan: give the scan. `beamline info` says what it holds"
+            f"{path} is a volume that this program wrote, not a scan. Give the scan; `beamline info` "
+            "shows what the volume contains"
         )

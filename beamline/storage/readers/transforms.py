@@ -29,8 +29,8 @@ def brief_source(base: ScanSource, over: Callable[[], bool]) -> ScanSource:
         n = frame_indices(frames, len(base.table)).size * len(range(base.shape[0])[rows])
         if over() or base.frame_bytes > UNPACKED or n * base.shape[1] * base.dtype.itemsize > _READ:
             raise TakesTooLongError(
-                "Not all frames were looked at that show what is wrong with a scan: it would take too long. `beamline "
-                "validate` looks at them."
+                "Not all frames that may show a fault of the scan were checked, because it would take "
+                "too long. `beamline validate` checks them all."
             )
         return read(frames, rows)
 
@@ -67,8 +67,8 @@ def cropped(base: ScanSource, cols: tuple[int, int]) -> ScanSource:
 
 
 _TURNED = (
-    "Frames are turned by a quarter turn, so that the last column becomes the first row. If the camera was turned the "
-    "other way, the volume is the mirror image of the sample."
+    "The frames are rotated by 90 degrees, so that the last column becomes the first row. If the camera "
+    "was rotated the other way, the volume is the mirror image of the sample."
 )
 
 
@@ -81,7 +81,7 @@ def turned(base: ScanSource) -> ScanSource:
         DataError: a scan with flags, which has a vertical axis.
     """
     if base.table.flags is not None:
-        raise DataError(f"{base.path} is a scan with a vertical rotation axis. Leave out --horizontal-axis.")
+        raise DataError(f"Omit --horizontal-axis: {base.path} is a scan with a vertical rotation axis.")
     sizes = (base.pixel_size_mm, None) if base.row_pitch_mm is None else (base.row_pitch_mm, base.pixel_size_mm)
     return Frames(
         base,
@@ -143,7 +143,9 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
     table, n, out = base.table, base.table.views.size, list[NDArray[np.int64]]()
     first, end, step = views.indices(n)
     if first >= end:
-        raise DataError(f"--frames selects no view: {base.path} has {n}. They are counted from 0, without references.")
+        raise DataError(
+            f"--frames selects no projection: {base.path} has {n} of them, counted from 0 without darks and flats."
+        )
     for kind in (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION):
         rows = table.of_kind(kind)
         in_turn = slice(first % step, None, step) if rows.size % step == 0 else WHOLE
@@ -172,10 +174,10 @@ def _of_one_energy(source: ScanSource, word: str) -> tuple[float, NDArray[np.boo
     try:
         kev = float(word.removeprefix(_ENERGY))
     except ValueError:
-        raise DataError(f"--frames {word}: expected a number of keV, such as energy=20.") from None
+        raise DataError(f"--frames {word}: expected a number in keV, such as energy=20.") from None
     known = source.table.energies
     if known is None:
-        raise DataError(f"--frames {word}: {source.path} states no energy of each frame. Leave it out.")
+        raise DataError(f"Omit --frames {word}: {source.path} does not state the energy of each frame.")
     others = np.abs(known - kev) > _SAME_ENERGY * kev
     if not (np.isfinite(known) & ~others).any():
         raise DataError(f"--frames {word}: no frame of {source.path} has this energy; {in_words(known)}.")
@@ -214,9 +216,10 @@ def _ranges(kinds: str, n: int) -> list[tuple[FrameKind, int, int]]:
             first, end = (int(match[1] or 0), int(match[2] or n)) if match else (0, 0)
             if name not in _KINDS or not first < end <= n:
                 raise DataError(
-                    f"--frames {kinds}: {word.strip()!r} is none of {', '.join(_KINDS)} with frames of 0:{n}; expected "
-                    "such as darks=0:5,flats=5:10+95:100, none=30:38+61:62 for frames that are left out, counted from "
-                    "0 in the order of the scan (`beamline info` shows it), or 0::2 for every second view."
+                    f"--frames {kinds}: {word.strip()!r} is not one of {', '.join(_KINDS)} with frames of "
+                    f"0:{n}. Expected, for example, darks=0:5,flats=5:10+95:100, none=30:38+61:62 for "
+                    "frames to leave out (counted from 0 in the order of the scan, which `beamline info` "
+                    "shows), or 0::2 for every second projection."
                 )
             ranges.append((_KINDS[name], first, end))
     return ranges
@@ -226,8 +229,8 @@ def as_unsigned(base: ScanSource, dtype: np.dtype[Any]) -> ScanSource:
     """A scan whose pixels are read as their true type: unsigned counts that were stored as signed ones, or reals that
     were stored as whole numbers.
     """
-    wrapped = f"int{8 * dtype.itemsize} that wrapped"
-    what = "real numbers by their bits, as no SampleFormat in the TIFF says" if dtype.kind == "f" else wrapped
+    wrapped = f"int{8 * dtype.itemsize} that overflowed"
+    what = "real numbers, judging by their bits, because the TIFF has no SampleFormat" if dtype.kind == "f" else wrapped
     fact = f"{what}, read as {dtype}"
     return Frames(
         base,
@@ -338,8 +341,8 @@ def in_parts(earlier: Sequence[ScanSource], last: ScanSource, path: Path | None 
     for source in earlier:
         if (source.shape, source.dtype, source.quantity) != (last.shape, last.dtype, last.quantity):
             raise DataError(
-                f"{source.path} has {source.quantity} of {source.dtype} {source.shape}, {last.path} "
-                f"{last.quantity} of {last.dtype} {last.shape}: they are no parts of one scan."
+                f"{source.path} has {source.quantity} of {source.dtype} {source.shape}, but {last.path} "
+                f"has {last.quantity} of {last.dtype} {last.shape}: they are not parts of one scan."
             )
     in_order = all(source.in_order for source in (*earlier, last))
     if path is None:

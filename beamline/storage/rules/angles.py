@@ -19,7 +19,7 @@ _SAME = 0.1  # of the mean step: views so close are one
 _EQUAL, _FEW = 1e-3, 4  # degrees between views of one direction; columns of the detector to a direction
 _FALSE_ALARM = 1e-3  # of scans whose views are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
-_COUNTED = " They are 0, 1, 2 and so on: do they count the frames?"
+_COUNTED = " The values are 0, 1, 2 and so on: are they frame numbers?"
 _LISTED = 20  # groups of frames in a sentence
 _MANY = 30  # views: fewer within 6.28 degrees may be a trial scan, and are not refused as radians
 
@@ -31,9 +31,9 @@ def angles_unknown(scan: ScanEvidence) -> str:
     runs = np.split(unknown, np.flatnonzero(np.diff(unknown) > 1) + 1)
     listed = "+".join(f"{run[0]}:{run[-1] + 1}" for run in runs[:_LISTED] if run.size) + "+..." * (len(runs) > _LISTED)
     return "" if not unknown.size else (
-        f"No angle for {unknown.size} of {views.size} projections (first: frame {unknown[0]}){why}. Give them with "
-        "--angles FILE (degrees, one a line)"
-        f"{f', or leave these views out: --frames none={listed}' * (unknown.size < views.size)}."
+        f"{unknown.size} of {views.size} projections have no angle (first: frame {unknown[0]}){why}. Give "
+            "the angles with --angles FILE (degrees, one per "
+            f"line){f', or leave these projections out: --frames none={listed}' * (unknown.size < views.size)}."
     )  # fmt: skip
 
 
@@ -47,15 +47,18 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "error",
             "angle-spread",
-            f"The projections are at up to {farthest:.3g} degrees; expected at most {FARTHEST:g}, beyond which "
-            "angles are not exact. Are their units right? Give them with --angles FILE (degrees, one a line).",
+            f"The angles of the projections reach {farthest:.3g} degrees; expected at most {FARTHEST:g}, "
+            "because larger ones are not exact. Is their unit right? Give them with --angles FILE "
+            "(degrees, one per line).",
         )
         return
     degrees = np.asarray(np.degrees(angles), np.float64)
     span = float(np.ptp(degrees))
     distinct = np.unique(np.round(degrees, 6))
     if distinct.size == 1:
-        yield Finding("error", "angle-spread", f"All {angles.size} projections are at {distinct[0]:g} degrees.")
+        yield Finding(
+            "error", "angle-spread", f"All {angles.size} projections have the same angle, {distinct[0]:g} degrees."
+        )
         return
     step = span / (distinct.size - 1)
     if (text := _no_degrees(angles, distinct)) is not None:
@@ -63,21 +66,22 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding("warning" if scan.source.plan else "error", "angle-spread", text)
     elif (unseen := half_turn_unseen(angles)) > 0:
         span_text = (
-            f"span {span:.2f} degrees: less than half a turn" if span + step < 180 else "do not go round half a turn"
+            f"span {span:.2f} degrees, less than 180" if span + step < 180 else "do not cover 180 degrees"
         )
         yield Finding(
             "warning",
             "angle-spread",
-            f"The projections {span_text} (limited angle): {unseen:.4g} of 180 degrees have no view."
-            + (_COUNTED if not scan.source.plan and np.allclose(degrees, np.arange(angles.size)) else ""),
+            f"The projections {span_text} (limited angle): in {unseen:.4g} of 180 degrees there is no "
+            "projection." + (_COUNTED if not scan.source.plan and np.allclose(degrees, np.arange(angles.size)) else ""),
         )
     elif scan.cone is None and (n := directions(angles)) <= min((distinct.size + 1) / 2, scan.source.shape[1] / _FEW):
         yield Finding(
             "warning",
             "angle-spread",
-            f"Views half a turn apart see the same rays: in steps of {step:.4g} degrees, {distinct.size} views see "
-            f"{n} directions only, few for {scan.source.shape[1]} columns. FBP leaves streaks there: compare with "
-            "--method fista-tv. A step that does not divide 180 degrees sees more directions.",
+            f"Compare with --method fista-tv, because FBP leaves streaks: the {distinct.size} projections "
+            f"show only {n} directions, which is few for {scan.source.shape[1]} columns. With steps of "
+            f"{step:.4g} degrees many projections are 180 degrees apart, and these measure the same rays. "
+            "Next time, use a step that does not divide 180 degrees.",
         )
 
 
@@ -122,20 +126,21 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
     between = float(np.median(np.abs(np.diff(np.degrees(angles)))))
     if look_like_degrees(angles):
         return (
-            f"{angles.size} projections span {np.ptp(distinct) / 360:.1f} turns, or {np.ptp(angles):.5g} in radians: "
-            "these look like degrees under a label of radians. If so, give them with --angles FILE (degrees, one a "
-            "line)."
+            f"{angles.size} projections span {np.ptp(distinct) / 360:.1f} turns, or {np.ptp(angles):.5g} "
+            "in radians. These look like degrees that are labelled as radians. If so, give them with "
+            "--angles FILE (degrees, one per line)."
         )
     if between >= 360:
         return (
-            f"The projections go from {distinct[0]:.6g} to {distinct[-1]:.6g} degrees, {between:.4g} from one to "
-            "the next, which is a turn or more: these look like counts of an encoder or of steps. Give them in "
-            "degrees with --angles FILE (one a line); if they are right, give them less whole turns."
+            f"The projections go from {distinct[0]:.6g} to {distinct[-1]:.6g} degrees in steps of "
+            f"{between:.4g}, a whole turn or more. These look like counts of an encoder or of motor "
+            "steps. Give the angles in degrees with --angles FILE (one per line). If they are right, "
+            "subtract whole turns."
         )
     if (unit := _smaller_unit(distinct, angles.size)) is not None:
         return (
-            f"{angles.size} projections span only {np.ptp(distinct):.4g} degrees: {unit} Give them in degrees with "
-            "--angles FILE (one a line), or say --angles-unit rad with it."
+            f"{angles.size} projections span only {np.ptp(distinct):.4g} degrees: {unit} Give the angles "
+            "in degrees with --angles FILE (one per line), or add --angles-unit rad."
         )
     return None
 
@@ -143,5 +148,5 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
 def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
     """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
     if part := gone_round(degrees, 2 * np.pi):
-        return f"these look like radians: {'half a turn' if part < 4 else 'a turn'} is {part:.5g}."
+        return f"these look like radians: {'180 degrees are' if part < 4 else '360 degrees are'} {part:.5g}."
     return "these look like radians or turns." if n > _MANY and np.ptp(degrees) <= 2 * np.pi else None

@@ -156,15 +156,18 @@ def angles_stand(seen: CoarseViews) -> Iterator[Finding]:
     )
     if across > _TURNED * beside:
         n = int(np.median(lengths[lengths >= _STANDS]))
-        first_of_each = f" Or --frames 0::{n} takes the first view of each angle." if (lengths[:-1] == n).all() else ""
+        first_of_each = (
+            f" Or use the first projection of each angle: --frames 0::{n}." if (lengths[:-1] == n).all() else ""
+        )
         yield Finding(
             "warning",
             "angle-spread",
-            f"Angles stand for {n} frames each, which differ (frames {first[0]} and {last[0]}, both stated at "
-            f"{seen.degrees[first[0]]:.6g} degrees, {across / beside:.2g} times as much as neighbours): angles were "
-            f"read back more slowly than frames came, while the stage turned. Give that of each of {degrees.size} "
-            f"views by --angles FILE (degrees, one a line), from {degrees[0]:.6g} in even steps where it turned evenly."
-            f"{first_of_each}",
+            f"Each angle is stated for {n} frames, but these differ: frames {first[0]} and {last[0]}, "
+            f"both stated at {seen.degrees[first[0]]:.6g} degrees, differ {across / beside:.2g} times as "
+            "much as neighbours do. The angles were read back more slowly than frames were taken, while "
+            f"the stage rotated. Give the angle of each of the {degrees.size} projections with --angles "
+            f"FILE (degrees, one per line), from {degrees[0]:.6g} in even steps if the stage rotated "
+            f"evenly.{first_of_each}",
         )
 
 
@@ -245,15 +248,15 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     known = [factor for factor in _FACTORS if abs(turn.degrees - 180 * factor) < np.ptp(degrees) / VIEWS]
     counted = np.allclose(degrees, np.arange(degrees.size))
     if counted:
-        unit = "they are 0, 1, 2 and so on, and count the views"
+        unit = "they are 0, 1, 2 and so on, so they are frame numbers"
     else:
         unit = f"they look {180 / turn.degrees:.3g} times as large as stated"
     pairs = (
-        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images, as views half a turn "
-        f"apart are, and are stated to be {turn.degrees:.4g} degrees apart"
+        f"Frames {turn.alike[0]} and {turn.alike[1]} are mirror images, as projections 180 degrees apart "
+        f"are, but they are stated {turn.degrees:.4g} degrees apart"
     )
     if turn.stated is not None:
-        pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated 180 degrees apart, are not"
+        pairs += f"; frames {turn.stated[0]} and {turn.stated[1]}, stated 180 degrees apart, are not mirror images"
     # A plan is of our own scans, whose angles are in degrees. Without views stated half a turn apart, a sample that is
     # symmetric may look so, too; and mistakes are by one of these factors, while a sample that moves may show any.
     sure = not scan.source.plan and turn.stated is not None and (counted or bool(known))
@@ -261,7 +264,7 @@ def _angles_finding(scan: ScanEvidence, degrees: NDArray[np.float64], turn: _Tur
     return Finding(
         "error" if sure else "warning",
         "angle-spread",
-        f"{pairs}. {which} angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one a line).",
+        f"{pairs}. {which} angles are not in degrees: {unit}. Give them in degrees with --angles FILE (one per line).",
     )
 
 
@@ -314,9 +317,10 @@ def _alike_elsewhere(seen: CoarseViews, rows: NDArray[np.int64]) -> Finding | No
     return Finding(
         "warning",
         ORDER,
-        f"{_stated(seen, (int(some[first]), int(some[like[first]])))} look more alike than neighbours, as {odd.sum()} "
-        f"of {some.size} views looked at do. Unless the sample is symmetric, the angles are not in the order of the "
-        "frames, or the sample went round more often than they state.",
+        f"{_stated(seen, (int(some[first]), int(some[like[first]])))} look more similar than neighbours "
+        f"do, and so do {odd.sum()} of {some.size} projections that were compared. Unless the sample is "
+        "symmetric, the angles are not in the order of the frames, or the sample rotated further than "
+        "they state.",
     )
 
 
@@ -326,12 +330,12 @@ def _stated(seen: CoarseViews, pair: Pair) -> str:
 
 
 def _in_another_order(seen: CoarseViews, jumps: NDArray[np.int64], far: Pair, near: Pair) -> Finding:
-    text = f"{_stated(seen, far)} look alike, and f{_stated(seen, near)[1:]} do not. "
+    text = f"{_stated(seen, far)} look similar, but f{_stated(seen, near)[1:]} do not. "
     single = np.intersect1d(jumps, jumps + 1)  # between two jumps
     if single.size and jumps.size == 2 * single.size and single.size <= _SINGLE * seen.rows.size:
         wrong = ", ".join(f"{row} ({seen.degrees[row]:.6g})" for row in seen.rows[single[:5]].tolist())
-        text += f"The angles of {single.size} views are not between those of their neighbours: frames {wrong}. "
-        return Finding("warning", ORDER, text + "Give the right ones with --angles FILE (degrees, one a line).")
+        text += f"The angles of {single.size} projections are not between those of their neighbours: frames {wrong}. "
+        return Finding("warning", ORDER, text + "Give the right ones with --angles FILE (degrees, one per line).")
     text += (
         "The angles are not in the order of the frames. Give one for each projection, in their order, with "
         "--angles FILE."

@@ -49,12 +49,12 @@ class FlagPolicy:
         parts = []
         for some, verbs in (
             (self.left_out, (("has an alarm and is", "have an alarm and are"), "left out")),
-            (self.halved, (("has a warning and weighs", "have a warning and weigh"), "half")),
-            (self.masked, (("is", "are"), "flagged in a part, where rays weigh half, with an alarm nothing")),
+            (self.halved, (("has a warning and counts", "have a warning and count"), "half")),
+            (self.masked, (("is", "are"), "flagged in a region, in which rays have half weight (with an alarm: none)")),
         ):
             if n := int(some.sum()):
                 parts.append(f"{n} {verbs[0][n > 1]} {verbs[1]} ({counted(self.flags.of(some).counts())})")
-        return f"Of {self.views.sum()} views {', '.join(parts)}." if parts else ""
+        return f"Of {self.views.sum()} projections, {', '.join(parts)}." if parts else ""
 
 
 def flag_policy(flags: FrameFlags, views: Mask, shape: tuple[int, int]) -> FlagPolicy:
@@ -127,21 +127,23 @@ def frames_flagged(scan: ScanEvidence) -> Iterator[Finding]:
         return
     message += f" Frames with an alarm: {spans(rows.tolist())}."
     if again.size:
-        message += f" Taken again: {count(again.size, 'view')}; the first ({frames_text(again)}) not used."
+        message += (
+            f" Taken again: {count(again.size, 'projection')}; the first attempts ({frames_text(again)}) are not used."
+        )
         rows = np.setdiff1d(rows, again)
         if not rows.size:
             yield Finding("info", FLAGS, f"{message} No other frame has an alarm.")
             return
-        message += f" Frames with an alarm beside these: {spans(rows.tolist())}."
+        message += f" Other frames with an alarm: {spans(rows.tolist())}."
     treated = flag_policy(flags, scan.table.are_views, scan.source.shape)
     n, lost = int(treated.views.sum()), int(treated.left_out.sum())
     if lost and n - lost < FEWEST_VIEWS:
         message += (
-            f" {n - lost} of {n} views are left, {FEWEST_VIEWS} are needed: repeat the scan. "
-            "`beamline recon --flags ignore` takes all views, flagged ones too."
+            f" Repeat the scan: only {n - lost} of {n} projections have no alarm, and {FEWEST_VIEWS} are "
+            "needed. `beamline recon --flags ignore` uses all projections, also flagged ones."
         )
         yield Finding("error", FLAGS, message)
         return
     if treated.in_words:
-        message += f" A reconstruction (--flags use): {treated.in_words}"
+        message += f" In a reconstruction (--flags use): {treated.in_words}"
     yield Finding("warning", FLAGS, message)

@@ -34,9 +34,9 @@ def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "axis",
-            f"From view to view the matter in a row changes {ratio:.3g} times as much as the matter in a column, as if "
-            f"the rotation axis were horizontal; it is expected along the columns. {_exchanged(scan)}If it is "
-            "horizontal, say --horizontal-axis.",
+            "The rotation axis seems to be horizontal; expected along the columns. Between projections, "
+            f"the total absorption of a row changes {ratio:.3g} times as much as that of a column. "
+            f"{_exchanged(scan)}If the axis is horizontal, give --horizontal-axis.",
         )
 
 
@@ -56,7 +56,7 @@ def _exchanged(scan: ScanEvidence) -> str:
     if scan.source.format == "data_exchange":
         data, others = "exchange/data", "".join(f" --{name}s-path exchange/{at}" for name, at in _EXCHANGE)
     order = ",".join({"row": "col", "col": "row"}.get(axis, axis) for axis in dimensions.split(","))
-    say = f"If rows and columns are exchanged, as MATLAB writes them, say --data-path {data}:{order}{others}. "
+    say = f"If rows and columns are exchanged, as MATLAB writes them, give --data-path {data}:{order}{others}. "
     return "" if data is None else say
 
 
@@ -105,10 +105,11 @@ def views_first(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "axis",
-            f"The {views.size} images look like sinograms: the rows of each hold one mass, whose centre goes along a "
-            f"sine of the angles ({along_rows:.0%} of its change), as views do, and from image to image it does not "
-            f"({along_frames:.0%}). Then the first dimension counts rows of the detector: --order row,view,col, or "
-            "in a file the attribute axes of the dataset (y:theta:x), says so.",
+            f"The {views.size} images look like sinograms, not projections. Within an image all rows have "
+            f"the same total absorption, and its centre follows a sine of the angle ({along_rows:.0%} of "
+            f"its change); from image to image it does not ({along_frames:.0%}). If so, the first "
+            "dimension counts detector rows: give --order row,view,col, or set the attribute axes of the "
+            "dataset in the file (y:theta:x).",
         )
 
 
@@ -127,8 +128,8 @@ def sinogram_told(scan: ScanEvidence) -> Iterator[Finding]:
         yield Finding(
             "info",
             SINOGRAM,
-            f"The array has two dimensions: it is taken as one sinogram of {n} views and {scan.source.shape[1]} "
-            f"columns. If they are the other way round, {option}.",
+            f"The array has two dimensions and is used as one sinogram of {n} projections and "
+            f"{scan.source.shape[1]} columns. If rows and columns are exchanged, {option}.",
         )
 
 

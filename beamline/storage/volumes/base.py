@@ -151,7 +151,8 @@ def record_of(path: Path, facts: Mapping[str, Any], values: Any) -> ReconRecord:
         )
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError, OSError) as error:
         raise DataError(
-            f"{path} lacks facts that volumes of this program have ({type(error).__name__}: {error}): it was changed."
+            f"{path} was changed: facts that volumes of this program have are missing "
+            f"({type(error).__name__}: {error})."
         ) from error
 
 
@@ -161,7 +162,7 @@ def bare_record(path: Path, values: Any, spacing: tuple[float, float, float] | N
     if 0 in values.shape:
         raise DataError(f"{path} has no voxels: its shape is {values.shape}; expected [z, y, x].")
     if not math.isclose(dy, dx, rel_tol=1e-3):
-        raise DataError(f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only square ones can be kept.")
+        raise DataError(f"{path} has voxels of {dy:g} x {dx:g} mm in a slice; only square ones can be stored.")
     return ReconRecord(
         volume=Volume(values, Grid(values.shape, dx, slice_pitch=dz)),
         length_unit="px" if spacing is None else "mm",

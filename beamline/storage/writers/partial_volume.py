@@ -163,11 +163,12 @@ def slabs_of_partial(path: Path) -> tuple[list[Slab], list[Slab]]:
 def _refuse_unusable(path: Path) -> None:
     if not is_partial(path):
         raise DataError(
-            f"{path} is not a partial volume; `beamline recon` leaves one if it is stopped after the first slab."
+            f"{path} is not a partial volume. `beamline recon` leaves one if it is stopped after the first slab."
         )
     if held(path):
         raise DataError(
-            f"{path} is open in another process, which adds slabs or reads it. Wait for its end. Nothing was touched."
+            f"{path} is open in another process that writes slabs to it or reads it. Wait until that "
+            "process ends. Nothing was changed."
         )
 
 

@@ -154,12 +154,15 @@ def put_exchange_view(path: Path) -> None:
         DataError: the disk does not take it, or has less than ROOM free.
     """
     if (free := shutil.disk_usage(path.parent).free) < ROOM:
-        raise DataError(f"{path}: its disk has {size(free)} free, of {size(ROOM)} for the view. Nothing was changed.")
+        raise DataError(
+            f"{path}: its disk has {size(free)} free, and {size(ROOM)} are needed for the /exchange view. "
+            "Nothing was changed."
+        )
     try:
         with hdf5.changed(path, layout.LIBVER) as file:
             add_exchange_view(file)
     except hdf5.ALTERED as error:
-        raise DataError(f"{path} does not take the view ({hdf5.reason(error)}).") from error
+        raise DataError(f"{path} does not accept the /exchange view ({hdf5.reason(error)}).") from error
 
 
 def _rows(file: h5py.File) -> dict[str, I64]:
@@ -171,7 +174,7 @@ def _rows(file: h5py.File) -> dict[str, I64]:
 
 STATUSES = ("complete", "stopped", "failed")
 RUNNING = "running"  # of a scan that goes on, or whose program died
-DIED = "The program that took the scan died."
+DIED = "The process that took the scan was killed."
 
 
 @dataclass(frozen=True)

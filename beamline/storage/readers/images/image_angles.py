@@ -62,7 +62,7 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
     another = any(len({*each}) > 1 and not are_a_count(each) for each in zip(*others, strict=False))
     doubt = _doubt_of_series(chosen, np.unique(degrees), doubt, words=words, another=another)
     if doubt:
-        doubt = f"angles in names such as {stems[-1]} are not used, since {doubt}"
+        doubt = f"angles in names such as {stems[-1]} are not used, because {doubt}"
     plain = [_without(name, match) for name, match in zip(names, chosen, strict=True)]
     return NamedAngles(plain, None if doubt else np.radians(degrees), doubt)
 
@@ -89,11 +89,13 @@ def _doubt_of_series(
     counted = are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3)
     uneven = chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not _in_even_steps(distinct))
     if words and counted:
-        return "the number beside the word counts the images"
+        return "the number next to the word counts the images"
     if not words and uneven:
-        return doubt or "the numbers that have signs are in no even steps within a turn"
+        return doubt or "the numbers with signs are not evenly spaced within 360 degrees"
     if distinct.size < _DISTINCT * len(chosen):
-        return doubt or f"{len(chosen)} names give only {distinct.size} angles; are signs or decimals lost?"
+        return (
+            doubt or f"{len(chosen)} names give only {distinct.size} different angles. Are signs or decimals missing?"
+        )
     return doubt
 
 
@@ -125,11 +127,11 @@ def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
             minus[:] = False
         elif (mark := _mark(chosen[0])) in "mn-\u2013":
             what = mark if mark in "mn" else "hyphen"
-            return degrees, f"the {what} before the number may be a minus sign, or separate"
+            return degrees, f"the {what} before the number may be a minus sign or a separator"
     if doubt := _doubt_of_decimals(chosen, before):
         return degrees, doubt
     if len({re.sub(r"\d+", "", text) for text in before}) > 1:
-        return degrees, "names differ before the angle, as by a sign that was replaced"
+        return degrees, "the names differ before the angle, for example because a sign was replaced"
     return np.where(minus, -degrees, degrees), ""
 
 
@@ -149,12 +151,14 @@ def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
     """Why the digits beside a point, or beside the number, may or may not be decimals; "" if that is clear."""
     parts, wholes = [each["part"] or "" for each in chosen], [each["whole"] for each in chosen]
     if are_a_count(parts) or (are_a_count(wholes) and len({*parts}) > 1):
-        return "one side of their point or comma counts the images"
+        return "the digits on one side of their point or comma count the images"
     following = [_FOLLOWING.match(each.string[each.end() :]) for each in chosen]
     for beside in (following, [_PRECEDING.search(text) for text in before]):
         halves = np.sort([int(each[1]) for each in beside if each])
         if not any(parts) and halves.size == len(chosen) and np.ptp(halves) and not _in_even_steps(halves):
-            return "the number beside each counts no images; are the two a whole number and its decimals?"
+            return (
+                "the number next to each angle does not count images; are the two numbers an integer and its decimals?"
+            )
     return ""
 
 

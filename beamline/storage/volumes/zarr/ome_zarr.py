@@ -75,8 +75,8 @@ class OmeZarr:
         for scale in (finest, *finest.coarser):
             if lost := scale.array.nchunks - scale.array.nchunks_initialized:
                 raise DataError(
-                    f"{path} lacks {lost} of {scale.array.nchunks} chunks of the scale {scale.array.basename}: the "
-                    "volume is cut off, or was changed."
+                    f"{path} is cut off or was changed: {lost} of {scale.array.nchunks} chunks of the "
+                    f"scale {scale.array.basename} are missing."
                 )
         yield record_of(path, facts, finest)
 
