@@ -91,7 +91,7 @@ class Instrument:
         """
         refuse_wrong_arguments(Instrument.scan, locals())
         if not self._one_at_a_time.acquire(blocking=False):
-            raise ConfigError("a scan of this instrument still runs: wait for its end. Nothing was started.")
+            raise ConfigError("a scan of this instrument is still running: wait until it ends. Nothing was started.")
         try:
             config = self._config_of(sample, energy_kev, set or {})
             return self._run(config, output, live, stop or StopRequest(), on_event)
@@ -107,9 +107,9 @@ class Instrument:
         config = changed(self.config, [override_of(key, value) for key, value in wanted.items()])
         if _of_devices(config) != _of_devices(self.config):
             raise ConfigError(
-                f"{', '.join(wanted)}: at least one of these keys belongs to devices that are open, and would have no "
-                "effect. Give it to `connect`. A single scan can have other angles, times, optics, checks, and the "
-                "camera's roi, binning and readout. Nothing was started."
+                f"{', '.join(wanted)}: at least one of these keys belongs to devices that are open, so it "
+                "would have no effect. Give it to `connect`. A single scan can change angles, times, "
+                "optics, checks, and the camera's roi, binning and readout. Nothing was started."
             )
         return config
 

@@ -120,7 +120,7 @@ def _rows(source: SourceOptions, rows: slice | tuple[int, int]) -> tuple[int, in
     with source.open() as opened:
         first, end, step = rows.indices(opened.shape[0])
     if step != 1:
-        raise ConfigError(f"rows {rows}: rows are taken one after the other; leave the step out. Nothing was written.")
+        raise ConfigError(f"rows {rows}: rows must be consecutive; omit the step. Nothing was written.")
     return first, end
 
 

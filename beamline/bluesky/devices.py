@@ -117,7 +117,7 @@ class TomoScan(Device):
         """
         task, began = self._task, time.monotonic()
         if task is None:
-            raise RuntimeError(f"{self.name}: kickoff comes before complete")
+            raise RuntimeError(f"{self.name}: call kickoff before complete")
         while not task.done():
             await asyncio.wait([task], timeout=POLL)
             yield WatcherUpdate(
@@ -146,7 +146,7 @@ class TomoScan(Device):
 
     def _refuse_second(self) -> None:
         if self._task is not None and not self._task.done():
-            raise RuntimeError(f"{self.name}: a scan is running; unstage ends it")
+            raise RuntimeError(f"{self.name}: a scan is running; call unstage to end it")
 
     def _scan(self) -> RunResult:
         sinks: list[Sink] = [self._stream, self._begun]

@@ -44,7 +44,7 @@ AnySection = TypeVar("AnySection", bound=Section)
 NO_LIVE = ("recon.live=false", "scan.decide=off")
 """Overrides of a run without a reconstruction."""
 
-NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none: its plan is taken as it is."
+NO_DECISIONS = "scan.decide {} needs a live reconstruction, and this scan has none, so it follows its plan."
 """For the operator of such a run, where it would decide otherwise."""
 
 
@@ -106,8 +106,8 @@ def _read_file(path: Path, printed_by: str) -> Tree:
     except OSError as error:
         if (kind := kind_of_data(path)) is not None:
             raise ConfigError(
-                f"{path} is {kind}, not a configuration: `beamline info {path}` says what it holds. Nothing was "
-                "started."
+                f"{path} is {kind}, not a configuration: `beamline info {path}` shows what it contains. "
+                "Nothing was started."
             ) from None
         raise ConfigError(f"{path} cannot be read: {error.strerror}. Nothing was started.") from None
     return read(text, str(path))
@@ -309,7 +309,10 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
     if isinstance(scene, str) and not (shipped / scene).is_file():
         scenes = " | ".join(f"scenes/{path.name}" for path in sorted((shipped / "scenes").glob("*.yaml")))
         at = ("simulation", "scene")
-        yield at, f"simulation.scene: there is no file {scene}; expected one beside this file, or {scenes}"
+        yield (
+            at,
+            f"simulation.scene: there is no file {scene}; expected one next to the configuration file, or {scenes}",
+        )
 
 
 def quantities(values: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
@@ -332,14 +335,15 @@ def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
     for key, fit in _ONE_FRAME_A_PULSE.items():
         if (value := getattr(camera, key)) not in fit:
             expected = f"expected {' | '.join(map(str, fit))}, or scan.mode: step"
-            what = f"devices.camera.{key} {value} does not give one frame a pulse, which a fly scan needs; {expected}"
+            what = f"devices.camera.{key} {value} does not give one frame per pulse, which a fly scan needs; {expected}"
             yield ("devices", "camera", key), what
     width = stage.settings.pulse_width
     if camera.trigger_active == "level" and (width is None or abs(width - scan.exposure_s) > 0.01 * scan.exposure_s):
         yield (
             ("devices", "camera", "trigger_active"),
-            f"devices.camera.trigger_active level exposes while the pulse lasts; set devices.stage.pulse_width_s "
-            f"({width}) to scan.exposure_s ({scan.exposure_s:g}), or trigger_active: edge",
+            "devices.camera.trigger_active level means that the exposure lasts as long as the pulse. Set "
+            f"devices.stage.pulse_width_s ({width}) to scan.exposure_s ({scan.exposure_s:g}), or "
+            "trigger_active: edge",
         )
 
 
@@ -356,7 +360,7 @@ def offset_places(config: Config) -> tuple[float, ...]:
     if not config.scan.offset_views:
         return ()
     if diameter is None:
-        raise ValueError("how far the sample is stepped follows from its diameter; set sample.diameter_mm")
+        raise ValueError("set sample.diameter_mm, which determines how far the sample is stepped")
     per_unit = mover.mm_per_deg if isinstance(mover, StageMover) else float(mover.kind == "simulated")
     if not per_unit:
         raise ValueError("devices.sample_mover cannot step the sample; set its kind to stage, and its mm_per_deg")
@@ -367,11 +371,14 @@ def offset_places(config: Config) -> tuple[float, ...]:
     n = math.ceil((diameter / field / 2 + off_middle - 0.45) / 0.9)
     if n < 1:
         raise ValueError(
-            f"the field of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set scan.offset_views to 0"
+            f"the field of view of {field:.4g} mm shows all of a sample of {diameter:.4g} mm; set "
+            "scan.offset_views to 0"
         )
     places = tuple(0.9 * field * step for step in range(-n, n + 1) if step)
     if isinstance(mover, StageMover):
-        mover.refuse_unreachable({f"the place for {mm:.4g} mm aside,": mover.in_deg + mm / per_unit for mm in places})
+        mover.refuse_unreachable(
+            {f"the position for an offset of {mm:.4g} mm,": mover.in_deg + mm / per_unit for mm in places}
+        )
     return places
 
 

@@ -18,7 +18,7 @@ from recon.base.setting import Setting, settings_of
 def port_problem(port: str) -> str:
     """What is wrong with a port; "" if it may be one. Names of ports, not URLs, have a colon only within a path."""
     wrong = re.match(r"[a-z]\w*:(?!//)|socket://(?!.+:\d+)", port, re.IGNORECASE)
-    return f"{port} is no port; expected one such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
+    return f"{port} is not a port; expected one such as COM3, /dev/ttyUSB0 or socket://host:7777" if wrong else ""
 
 
 SEVERAL_LINES = ("description", "pattern", "query", "line_end")  # keys whose text may have control characters
@@ -43,8 +43,9 @@ class Section(BaseModel):
                 raise ValueError(f"{name} is {str(value).lower()} (YAML reads yes, no, on and off as true and false)")
             if isinstance(value, str) and name not in SEVERAL_LINES and (found := min(value, default=" ")) < " ":
                 raise ValueError(
-                    f"{name} is {value!r}, with the control character {found!r}: within double quotes a backslash "
-                    "begins one; write the text without quotes, or within single ones"
+                    f"{name} is {value!r}, with the control character {found!r}. In double quotes a "
+                    "backslash starts such a character; write the text without quotes, or in single "
+                    "quotes"
                 )
         return data
 

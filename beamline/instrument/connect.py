@@ -58,14 +58,16 @@ else:
 
 from drivers.base.errors import DeviceError
 
-_STATE = "What was acquired so far is in the file"
+_STATE = "Frames taken so far are in the file"
 
 
 def ask_operator(request: str) -> None:
     """Ask the operator at the terminal, and wait for Enter. Raises DeviceError without a terminal or a confirmation."""
     if not sys.stdin.isatty():
-        advice = "Run it in a terminal, or configure a shutter and a sample mover that need no hand"
-        raise DeviceError("operator", "there is no terminal to ask at", request=request, advice=advice, state=_STATE)
+        advice = "Run it in a terminal, or configure a shutter and a sample mover that are not moved by hand"
+        raise DeviceError(
+            "operator", "there is no terminal to ask the operator", request=request, advice=advice, state=_STATE
+        )
     try:
         # A read from a terminal goes on after a signal, so that a stop takes effect only when it returns.
         how = "Then press Enter (to stop the scan: Ctrl-C, then Enter)"
@@ -121,7 +123,7 @@ def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_st
     Raises:
         DeviceError: the sensor does not get cold, or its cooler is off or in trouble.
     """
-    click.echo(f"Waiting for a cold sensor, at most {seconds:g} s; Ctrl-C ends it.", err=True)
+    click.echo(f"Waiting until the sensor is cold, at most {seconds:g} s; Ctrl-C ends the wait.", err=True)
     told = -math.inf
 
     def progress(celsius: float, status: str) -> None:
@@ -129,7 +131,7 @@ def wait_until_cold(camera: CooledCamera, seconds: float, clock: Clock, check_st
         check_stop()
         if clock.now() - told >= TELL_EVERY:
             told = clock.now()
-            click.echo(f"The sensor has {celsius:.1f} °C, its cooler says {status}.", err=True)
+            click.echo(f"The sensor is at {celsius:.1f} °C; its cooler reports {status}.", err=True)
 
     camera.wait_until_cold(seconds, progress)
 
@@ -282,7 +284,7 @@ def _instrument(
 ) -> Devices:
     chosen = config.devices.camera
     if isinstance(chosen, SimulatedOrca):
-        raise ConfigError("a real stage goes with a real camera; set devices.camera.kind: dcam")
+        raise ConfigError("a real stage needs a real camera; set devices.camera.kind: dcam")
     stage = _held(config.devices.stage.connect(clock), opened)
     camera: Camera
     if isinstance(chosen, DcamOrca):

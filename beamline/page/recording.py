@@ -129,7 +129,7 @@ class Recording:
         """
         frames = self.progress().frames
         if not 0 <= frame < frames:
-            raise DataError(f"Frame {frame} is not in the file, which holds {frames}.")
+            raise DataError(f"Frame {frame} is not in the file, which has {frames}.")
         region = region.inside(self.shape)
         rows, cols = region.slices
         factor = region.binning()
@@ -195,8 +195,8 @@ class Recording:
 
 def _foreign(path: Path) -> DataError:
     return DataError(
-        f"{path} was not written by `beamline scan`, so that there is nothing to follow: `beamline view {path}` shows "
-        f"what it holds, and `beamline recon {path}` reconstructs a scan."
+        f"{path} was not written by `beamline scan`, so it cannot be followed. `beamline view {path}` "
+        f"shows what it contains, and `beamline recon {path}` reconstructs a scan."
     )
 
 

@@ -58,12 +58,12 @@ def watched(path: Path) -> Watched:
         folder = parts_of(path)[-1]
         if not is_below(folder, EVENTS):
             raise DataError(
-                f"{path} is no folder of a run: it has no {EVENTS}. Name a run, or a scan file; `beamline "
-                f"view {path}` shows images."
+                f"{path} is not the folder of a run: it has no {EVENTS}. Name a run, or a scan file; "
+                f"`beamline view {path}` shows images."
             )
         return Watched(_joined(folder), folder)
     if not path.is_file():
-        raise DataError(f"{path} is not there.")
+        raise DataError(f"{path} does not exist.")
     of_run = path.name == SCAN and is_below(path.parent, SCAN) and is_below(path.parent, EVENTS)
     return Watched(_joined(path.parent), path.parent) if of_run else Watched(path, None)
 

@@ -47,7 +47,7 @@ class _OverFlats:
     def __init__(self, source: ScanSource) -> None:
         self.source, self.frames = source, source.table.views
         if not self.frames.size:
-            raise DataError(f"{source.path} has no projections to show: `beamline info` says what its frames are.")
+            raise DataError(f"{source.path} has no projections to show: `beamline info` lists the kinds of its frames.")
         self.shape = self.frames.size, *source.shape
         self.dark, self.flat = self._mean(FrameKind.DARK), self._mean(FrameKind.FLAT)
         self._zero = np.zeros(source.shape, np.float32) if self.dark is None else self.dark
@@ -99,10 +99,11 @@ class ShownScan:
         """Format and angles in a sentence, kinds of frames that have a mean, the mean light of each view so far (null:
         not read), two views about half a turn apart and the degrees by which they miss it (null: none)."""
         known = self._degrees[np.isfinite(self._degrees)]
-        angles = f"{known.min():.2f} to {known.max():.2f} degrees" if known.size else "angles not known: give --angles"
-        over = "as they are: there are no flats" if self._views.flat is None else "over flats"
+        angles = f"{known.min():.2f} to {known.max():.2f} degrees" if known.size else "angles unknown: give --angles"
+        over = "shown as stored, because there are no flats" if self._views.flat is None else "over flats"
         return {
-            "said": f"{self._source.format}, {known.size} of {self._degrees.size} views with angles, {angles}; {over}",
+            "said": f"{self._source.format}, {known.size} of {self._degrees.size} projections with angles, "
+            f"{angles}; {over}",
             "means": [name for name, mean in self._means().items() if mean is not None],
             "light": [float(each) if np.isfinite(each) else None for each in self._views.light],
             "pair": self._pair(),
@@ -125,13 +126,13 @@ class ShownScan:
             DataError: the views cannot be corrected, or have no angles.
         """
         self._read(row, 0.0)
-        axis, said, is_cone = (self._source.shape[1] - 1) / 2, "the detector's middle", self._cone is not None
+        axis, said, is_cone = (self._source.shape[1] - 1) / 2, "the middle of the detector", self._cone is not None
         if self._source.axis_col is not None:
-            axis, said = self._source.axis_col, "as the file states"
+            axis, said = self._source.axis_col, "from the file"
         elif not is_cone:
             with suppress(ValueError):
                 found = find_axis(self._lines, self._source.table.angles[self._ids])
-                axis, said = found.value, f"found by row {row}{'' if found.confident else ', not a clear optimum'}"
+                axis, said = found.value, f"found from row {row}{'' if found.confident else ', not a clear optimum'}"
         return {"axis": round(axis, 2), "said": said, "leans": not is_cone}
 
     def fbp(self, row: int, axis_col: float, tilt_deg: float, region: TileRegion, *, fast: bool) -> VolumeTile:
@@ -187,7 +188,7 @@ class ShownScan:
         """Correct the rows that a slice needs, which are kept for the next slices."""
         rows, cols = self._source.shape
         if not 0 <= row < rows:
-            raise DataError(f"Row {row} is not on a detector of {rows} rows.")
+            raise DataError(f"Row {row} is outside the detector, which has {rows} rows.")
         beside = _BESIDE + math.ceil(cols / 2 * math.sin(math.radians(abs(tilt_deg))))
         if row == self._row and beside <= self._beside:
             return
@@ -199,7 +200,7 @@ class ShownScan:
             near, far = min(near, math.floor(min(edges))), max(far, math.ceil(max(edges)))
         frames = self._views.frames[np.isfinite(self._degrees)]
         if not frames.size:
-            raise DataError(f"{self._source.path} states no angles, which a slice needs: give --angles FILE.")
+            raise DataError(f"Give --angles FILE: a slice needs angles, and {self._source.path} states none.")
         some = spread_views(self._source.table.angles[frames], _VIEWS, frames)
         band = range(max(near, 0), min(far + 1, rows))
         try:
@@ -208,7 +209,7 @@ class ShownScan:
             )
             corrected = self._correction.at_once(some, slice(band.start, band.stop))
         except ValueError as error:
-            raise DataError(f"The views cannot be corrected: {error}.") from error
+            raise DataError(f"The projections cannot be corrected: {error}.") from error
         self._lines, self._ids = corrected.data, corrected.view_ids
         self._row, self._beside, self._band = row, beside, band
 

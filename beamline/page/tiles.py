@@ -114,7 +114,7 @@ def numbers_of(request: Request, name: str, n: int, what: str) -> list[float]:
         numbers = [float(word) for word in request.query_params.get(name, "").split(",")]
         if len(numbers) == n and all(abs(each) < 1e6 for each in numbers):
             return numbers
-    raise DataError(f"The query lacks {name}={what}.")
+    raise DataError(f"{name}={what} is missing in the query.")
 
 
 def region_of(request: Request) -> TileRegion:

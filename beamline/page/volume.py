@@ -288,7 +288,7 @@ class ShownVolume:
 
     def _part(self, axis: int, index: int, region: TileRegion, time: int) -> tuple[NDArray[Any], TileRegion, int]:
         if not (0 <= axis < 3 and 0 <= index < self.shape[axis]):
-            raise DataError(f"Slice {index} across axis {axis} is not in a volume of {self.shape}.")
+            raise DataError(f"Slice {index} across axis {axis} is outside the volume of {self.shape}.")
         return self._at(time).part(axis, index, region)
 
     def _sample(self, time: int) -> F32:

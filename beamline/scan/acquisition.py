@@ -111,11 +111,11 @@ class Acquisition:
     def _blocks(self) -> Iterator[Frame]:
         place, filter_ = self._timeline.plan.filter, self._devices.filter
         if filter_ is not None and place is not None and not self._stop.stopping:
-            self._sink(StateEntered(self._supervision.states.state, f"The filter goes to {place}"))
+            self._sink(StateEntered(self._supervision.states.state, f"Moving the filter to {place}"))
             filter_.put(place)
         energy, monochromator = self._timeline.plan.energy, self._devices.monochromator
         if monochromator is not None and energy is not None and not self._stop.stopping:
-            self._sink(StateEntered(self._supervision.states.state, f"The monochromator goes to {energy:.7g} keV"))
+            self._sink(StateEntered(self._supervision.states.state, f"Moving the monochromator to {energy:.7g} keV"))
             monochromator.move_to(energy)
         enough = False  # the views
         for block in self._timeline.blocks:
@@ -220,7 +220,7 @@ class Acquisition:
             replaces = -1 if frame.replaces in rows_astray else frame.replaces
             yield replace(frame, angle=angle, trigger=trigger, replaces=max(row, replaces))
         if rows := [retakes[i].row for i in taken.missing if retakes[i].row >= 0]:
-            self._sink(Warned(f"Frames {spans(rows)} gave no frame when they were repeated."))
+            self._sink(Warned(f"Frames {spans(rows)}: repeated, but again without a frame."))
 
     def _offset(self, block: Block) -> Iterator[Frame]:
         """Offset views, at angles of the first views. Nothing replaces anything."""
@@ -243,7 +243,7 @@ class Acquisition:
         """Wait with an open shutter until the scintillator is warm; a stop ends the wait."""
         if not (seconds := self._timeline.plan.warm_up):
             return
-        self._sink(StateEntered(self._supervision.states.state, f"The scintillator warms up for {seconds:g} s"))
+        self._sink(StateEntered(self._supervision.states.state, f"Warming up the scintillator for {seconds:g} s"))
         deadline = self._clock.now() + seconds
         while (left := deadline - self._clock.now()) > 0 and not self._stop.stopping:
             self._clock.sleep(min(SLICE, left))
@@ -273,7 +273,7 @@ class Acquisition:
         if not self._stop.stopping:
             if reopen:
                 set_shutter_and_sample(self._devices, block, self._warm_up)
-            states.enter(_state_of(block), "The scan goes on")
+            states.enter(_state_of(block), "The scan continues")
 
     def _raise_outcome(self) -> None:
         blocks = [block for block in self._timeline.blocks if block.kind is FrameKind.PROJECTION]
@@ -287,13 +287,14 @@ class Acquisition:
             if self.n_frames == 0:
                 raise ScanAborted(f"Interrupted before the first frame: {self._stop.reason}.")
             raise ScanStopped(
-                f"Stopped after {views} of {planned} projections: {self._stop.reason}. The file is complete as far as "
-                f"it goes.{discrepancies(self._done)}"
+                f"Stopped after {views} of {planned} projections: {self._stop.reason}. The file contains "
+                f"everything that was taken until then.{discrepancies(self._done)}"
             )
         if text := discrepancies(self._done):
             raise LedgerError(
-                f"{text.strip()} Every other frame is in the file with the angle of its trigger. Repeat these views, "
-                "or reconstruct without them; a longer period_s leaves the camera more time.",
+                f"{text.strip()} All other frames are in the file with the angle of their trigger. Repeat "
+                "these projections, or reconstruct without them. A longer period_s gives the camera more "
+                "time.",
                 self.missing,
             )
 

@@ -42,12 +42,12 @@ def prepare_memory(memory: FrameMemory | None, timeline: Timeline, shape: tuple[
     n = min(frames_in_memory(timeline), free_memory() // (4 * timeline.frame_bytes))
     if memory is None or n == 0:
         return ""
-    frames = f"Memory for {count(n, 'frame')}, {size(n * timeline.frame_bytes)}"
+    frames = f"Memory for {count(n, 'frame')} ({size(n * timeline.frame_bytes)})"
     try:
         memory.prepare(n, shape)
     except MemoryError:
-        return f"{frames}, cannot be had before they come"
-    return f"{frames}, is ready"
+        return f"{frames} cannot be reserved before the scan"
+    return f"{frames} is reserved"
 
 
 def hold_for_space(pause: PauseRequest, reserve: int, free: int, left: int) -> None:
@@ -62,8 +62,8 @@ def hold_for_space(pause: PauseRequest, reserve: int, free: int, left: int) -> N
     if left and free < min(reserve, left) + CLOSING:
         pause.hold(
             Cause.SPACE,
-            f"{size(free)} are free on the scan's disk, and {size(left)} are still to come. Free some: at "
-            f"{size(again)} the scan goes on by itself",
+            f"Free some space on the scan's disk: {size(free)} are free, and {size(left)} are still to be "
+            f"written. The scan continues automatically when {size(again)} are free",
         )
     elif not left or free >= again:
         pause.release(Cause.SPACE)
@@ -79,14 +79,17 @@ def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: flo
     """
     if 4 * waiting >= 3 * most:
         what, advice = (
-            ("the disk is behind", "a longer period_s or a faster disk")
+            ("The disk is too slow", "a longer period_s or a faster disk")
             if writing > checking
-            else ("the processor is behind", "a longer period_s, no live reconstruction or fewer programs beside it")
+            else (
+                "The processor is too slow",
+                "a longer period_s, a scan without live reconstruction, or fewer other programs",
+            )
         )
         pause.hold(
             Cause.BACKLOG,
-            f"{what}, {waiting} of at most {most} frames wait in memory. The scan goes on by "
-            f"itself when most of them are written; {advice} spares the pauses",
+            f"{what}: {waiting} of at most {most} frames wait in memory. The scan pauses, and continues "
+            f"automatically when most of them are written. To avoid such pauses, use {advice}",
         )
     elif 4 * waiting <= most:
         pause.release(Cause.BACKLOG)

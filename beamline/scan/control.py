@@ -172,8 +172,9 @@ class Asked:
                 return None
             if _taken(request):
                 raise ConfigError(
-                    f"the scan in {self.part} does not answer: it has died, or its disk hangs. Nothing was changed. If "
-                    "it has died, look at the instrument, and run `beamline recover` on its file."
+                    f"the scan in {self.part} does not answer: its process was killed, or its disk hangs. "
+                    "Nothing was changed. If it was killed, check the instrument, and run `beamline "
+                    "recover` on its file."
                 )
         state = state_of(self.part)
         return state if _done(state, self.verb) or seconds > EFFECT_WITHIN else None
@@ -195,8 +196,8 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
         raise ConfigError(f"no scan is running in {run}. Nothing was changed.")
     if isinstance(verb, Choice) and (state := state_of(part)) is not State.ASKING:
         raise ConfigError(
-            f"the scan in {run} does not ask what to measure next: it is {state}. It asks after each pass of views, "
-            "where scan.decide is ask. Nothing was changed."
+            f"the scan in {run} is not waiting for a decision on what to measure next: it is {state}. "
+            "With scan.decide: ask, it waits after each pass of projections. Nothing was changed."
         )
     try:
         request.touch()

@@ -21,7 +21,7 @@ from beamline.scan.supervision import PAUSE_POLL
 from drivers.base.frame import FrameKind
 from recon.base.error_law import BELOW, ErrorLaw
 
-_NO_LAW = LawMeasured(0, 0, math.nan, math.nan, math.nan, math.nan, reason="none came yet")
+_NO_LAW = LawMeasured(0, 0, math.nan, math.nan, math.nan, math.nan, reason="no prediction has arrived yet")
 
 
 @dataclass(eq=False, kw_only=True)
@@ -81,8 +81,12 @@ class Decider:
         if choice in self._answers:
             self._answer = choice
         else:
-            expected = f"expected {', '.join(sorted(self._answers))}" if self._answers else "the scan does not ask now"
-            self.sink(Warned(f"The choice {choice!s} changed nothing: {expected}."))
+            expected = (
+                f"expected {', '.join(sorted(self._answers))}"
+                if self._answers
+                else "the scan is not waiting for a decision now"
+            )
+            self.sink(Warned(f"The choice {choice!s} had no effect: {expected}."))
 
     def __call__(self, passes: Passes) -> Choice:
         """What is measured next, after a wait for the law and, if the operator is asked, for the answer."""
@@ -102,7 +106,10 @@ class Decider:
                 or (self._law.reason if self._law.number == self.number else "")
                 or f"no prediction within {self.wait:g} s"
             )
-        asks, remark = self.asks and not self._no_more_laws, "" if law else f"Gains are not known: {reason}."
+        asks, remark = (
+            self.asks and not self._no_more_laws,
+            "" if law else f"The expected improvement is not known: {reason}.",
+        )
         pass_ended, done = (self.number, passes.n_frames // self.timeline.plan.frames_per_view), len(passes.done)
         rows = [  # an event has None for NaN
             {name: None if value != value else value for name, value in vars(option).items()} for option in offered
@@ -176,7 +183,9 @@ class Decider:
         def answered() -> bool:
             if self.states.state is not State.ASKING:  # at first, and after a pause
                 self.close_shutter()
-                self.states.enter(State.ASKING, next(messages, "The scan asks again what to measure next"))
+                self.states.enter(
+                    State.ASKING, next(messages, "The scan again waits for a decision on what to measure next")
+                )
             return self._answer is not None
 
         self.wait_a_moment()  # earlier input does not count
@@ -185,4 +194,4 @@ class Decider:
         self._answers = frozenset()
         if self._answer is None:
             return "plan", Choice.NEXT, f"no answer within {self.wait:g} s"
-        return "operator", self._answer, "the operator chose it"
+        return "operator", self._answer, "chosen by the operator"

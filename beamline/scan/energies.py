@@ -72,11 +72,13 @@ def scans_in(folder: Path, warn: Warn) -> list[Path]:
     whole = [run for run in runs if run is not None and describe(run).state == State.DONE]
     if files and len(whole) < len(runs):
         warn(
-            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan, and {len(files)} are used. "
-            f"`beamline scan --resume {folder}` takes the rest."
+            f"{folder}: {len(whole)} of {len(runs)} energies have a complete scan; {len(files)} with "
+            f"frames are used. `beamline scan --resume {folder}` takes the rest."
         )
     if not files:
-        raise DataError(f"{folder} has no scan yet: `beamline scan --resume {folder}` takes them. Nothing was written.")
+        raise DataError(
+            f"{folder} has no scan yet: `beamline scan --resume {folder}` takes the scans. Nothing was written."
+        )
     return files
 
 
@@ -153,7 +155,7 @@ def _new_folder(config: Config, place: Path) -> Path:
 def _runs(series: Path, config: Config) -> list[Path | None]:
     """The newest run folder of each energy of a series; None: there is none."""
     if not is_series(series):
-        raise ConfigError(f"{series} is not the folder of a series of energies. Nothing was changed.")
+        raise ConfigError(f"{series} is not the folder of an energy series. Nothing was changed.")
     run_of_energy = dict[float | None, Path]()
     for run in sorted(path.parent for path in series.glob(f"*/{SCAN}")):
         run_of_energy[load(run / CONFIG, environment={}).scan.energy] = run
@@ -171,7 +173,9 @@ def _job(run: Path | None, held: ExitStack) -> Path | ResumableRun | None:
     except (NotJoined, NothingMissing):
         recover_run(run)  # which ends the record of one that died in its last fit
     except DataError as error:
-        raise DataError(f"{error} If {run} cannot be recovered, move it away: --resume then takes it anew.") from None
+        raise DataError(
+            f"{error} If {run} cannot be recovered, move it to another place: --resume then takes this scan again."
+        ) from None
     return scan_file(run)
 
 
@@ -182,7 +186,7 @@ def _tell(event: Event, sinks: Sequence[Sink]) -> None:
 def _after_failure(folder: Path, n: int, of: int, sinks: Sequence[Sink]) -> None:
     """Say how the series can go on; remove its folder where no scan has one in it."""
     if any(path.is_dir() for path in folder.iterdir()):
-        _tell(Warned(f"The series ended at energy {n} of {of}: `beamline scan --resume {folder}` goes on."), sinks)
+        _tell(Warned(f"The series ended at energy {n} of {of}. `beamline scan --resume {folder}` continues it."), sinks)
         return
     (folder / CONFIG).unlink()
     folder.rmdir()

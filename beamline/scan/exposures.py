@@ -150,9 +150,10 @@ class Exposures:
         self._camera.disarm()
         if flight.ledger.last < 0 and not cut_short and train.n >= SILENT_EXPOSURES:
             raise InstrumentError(
-                f"{self._camera.name}: none of {train.n} triggers gave a frame while the stage turned from "
-                f"{math.degrees(start):.4g}° to {math.degrees(end):.4g}°. Check the trigger cable, its polarity "
-                "and the stage's trigger output. What was taken before is in the file."
+                "Check the trigger cable, its polarity and the stage's trigger output. "
+                f"{self._camera.name}: none of {train.n} triggers gave a frame while the stage turned "
+                f"from {math.degrees(start):.4g}° to {math.degrees(end):.4g}°. Earlier frames are in the "
+                "file."
             )
         return flight.ledger.last + 1 if flight.paused else train.n
 
@@ -193,8 +194,8 @@ class Exposures:
                 if self._clock.now() >= flight.last_due + tail:
                     break  # no trigger is still to come: what is missing is named with the rest of the pass
                 raise InstrumentError(
-                    f"{self._camera.name}: no frame for {wait:.3g} s while the stage turned. Check the trigger "
-                    "cable and the camera. What was taken before is in the file."
+                    f"Check the trigger cable and the camera. {self._camera.name}: no frame for "
+                    f"{wait:.3g} s while the stage turned. Earlier frames are in the file."
                 )
         if flight.paused:
             return
@@ -251,7 +252,7 @@ class Exposures:
                     tried[i] += 1
                     stands_at = math.nan
                     if len(taken.astray) == tried[i] == 1:
-                        self._sink(Warned(f"View {i}: {wrong}"))
+                        self._sink(Warned(f"Projection {i}: {wrong}"))
                     if tried[i] == TRIES:
                         taken.miss([i])
                         tried[i] = 0
@@ -263,8 +264,8 @@ class Exposures:
             silent += 1
             if silent == SILENT_EXPOSURES:
                 raise InstrumentError(
-                    f"{self._camera.name}: {silent} triggers in a row gave no frame within {patience:.3g} s each. "
-                    "Check the camera. What was taken before is in the file."
+                    f"Check the camera. {self._camera.name}: {silent} triggers in a row gave no frame "
+                    f"within {patience:.3g} s each. Earlier frames are in the file."
                 )
             self._arm_anew(block.n - i)  # discards a late frame, which must not count as the next one
         self._camera.disarm()

@@ -108,7 +108,7 @@ class AlarmReaction:
 
     def _act(self, flag: Flag) -> None:
         n = self._in_a_row[flag.check]
-        frames = f"{n} frames in a row have" if n > 1 else "1 frame has"
+        frames = f"{n} consecutive frames have" if n > 1 else "1 frame has"
         reason = f"{frames} an alarm of the monitor's {flag.check} check: {flag.advice.rstrip('.')}"
         match self._policies.get(flag.check, Policy.LOG):
             case Policy.WARN:

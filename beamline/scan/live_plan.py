@@ -68,8 +68,10 @@ def better_order(plan: ScanPlan) -> tuple[str, ...]:
     else:
         return ()
     return (
-        "until the last view the live volume knows a sector: after a quarter, half and three quarters of a scan of "
-        f"particles it has {_SEQUENTIAL} dB, by scan.angles {other} {expected} dB, and in the end the same",
+        "with angles in sequence the live volume is a limited-angle reconstruction until the last "
+        f"projection. In a test scan of particles it has {_SEQUENTIAL} dB after a quarter, half and three "
+        f"quarters of the scan. With scan.angles {other} it has {expected} dB; the final volume is the "
+        "same",
     )
 
 
@@ -83,14 +85,15 @@ def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
     """A sentence on the live volume: its views and pixels, its memory, and the reason for its size."""
     plan = live_plan(shape, n_views, free)
     rows, cols = (max(1, n // plan.binning) for n in shape)
-    views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} that are free"
+    views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} of free memory"
     need = (
-        f"the live volume is of {count(views, 'view')} of {rows} x {cols} pixels, in about {size(plan.bytes)} of memory"
+        f"the live volume uses {count(views, 'projection')} of {rows} x {cols} pixels and about "
+        f"{size(plan.bytes)} of memory"
     )
     if plan.whole:
-        return f"{need}; it may take {most}"
-    how = [f"one view of {plan.every}"] if plan.every > 1 else []
+        return f"{need}; at most {most} is allowed"
+    how = [f"one projection in {plan.every}"] if plan.every > 1 else []
     how += [f"pixels binned {plan.binning} x {plan.binning}"] if plan.binning > 1 else []
-    whole = f"all {n_views} of {shape[0]} x {shape[1]} would take {size(live_bytes(shape, n_views))}"
-    wide = f"at most {_WIDEST} columns, and " if shape[1] > _WIDEST else ""
-    return f"{need}: {', '.join(how)}, since it takes {wide}{most}; {whole}. `beamline recon` makes the full one"
+    whole = f"all {n_views} projections of {shape[0]} x {shape[1]} would need {size(live_bytes(shape, n_views))}"
+    wide = f"at most {_WIDEST} columns and " if shape[1] > _WIDEST else ""
+    return f"{need}: {', '.join(how)}, because it may use {wide}{most}; {whole}. `beamline recon` makes the full volume"

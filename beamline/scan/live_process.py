@@ -81,10 +81,10 @@ def commands_of(config: Config, series: ResumableRun | None = None) -> Commands:
     if not config.recon.live:
         return Commands()
     if not streams(method):
-        remark = f"{method} needs the complete scan: the volume comes after it."
+        remark = f"{method} needs the complete scan, so the reconstruction starts after it."
         return Commands(afterwards=finished_command(config), remark=remark)
     if series is not None and series.end_references is not None:
-        remark = "Only darks and flats are taken: the volume is made of joined.h5 afterwards."
+        remark = "Only darks and flats are taken now: reconstruct joined.h5 afterwards."
         return Commands(afterwards=finished_command(config), remark=remark)
     _, camera, _ = describe(config)
     plan = live_plan(camera.shape, plan_of(config).n_views, free_memory())
@@ -121,7 +121,10 @@ def abort_watch(stop: StopRequest, say: Callable[[str], None]) -> Callable[[], b
         if stop.stopping and not stop.aborting and stop.seconds >= due:
             due = stop.seconds + _SAY_EVERY
             waited = f"{stop.seconds:.0f} of at most {most:.0f} s"
-            say(f"Waiting for the live volume of the views so far: {waited}. Ctrl-C ends the scan without it")
+            say(
+                f"Waiting for the live volume from the projections taken so far ({waited}). Press Ctrl-C to "
+                "finish without it"
+            )
         return stop.aborting
 
     return aborting
@@ -187,16 +190,17 @@ class LiveReconstruction:
         deadline = time.monotonic() + seconds
         if not self._ready.is_set():
             say(
-                "Waiting until the live reconstruction has compiled its kernels (once on a machine 1 to 2 minutes, "
-                f"otherwise seconds; at most {seconds:.0f} s). A pause begins after this wait; a stop ends it"
+                "Waiting until the live reconstruction has compiled its kernels (1 to 2 minutes the "
+                f"first time on a computer, otherwise seconds; at most {seconds:.0f} s). A pause starts "
+                "after this wait; a stop ends the wait"
             )
         while self._process is not None and self._process.running and not stop():
             if self._ready.wait(_POLL):
                 return
             if time.monotonic() >= deadline:
                 message = (
-                    f"The live reconstruction is not ready after {seconds:.0f} s. The scan begins; the volume takes "
-                    "its views up later."
+                    f"The scan starts now. The live reconstruction is still loading after {seconds:.0f} s "
+                    "and will catch up later."
                 )
                 self._sink(Warned(message))
                 return
@@ -219,7 +223,7 @@ class LiveReconstruction:
                 ProcessEnd.SILENT: f"it was stopped after {self._silence:.0f} s without output",
             }
             reason = reasons.get(ending, f"it ended with code {process.code}")
-            message = f"The {self._what} gave no volume: {reason}; see {self._log.name}. The scan is not affected."
+            message = f"The {self._what} gave no volume: {reason}. See {self._log.name}. The scan is not affected."
             self._sink(Warned(message, source="recon"))
         return self._done
 
@@ -241,14 +245,14 @@ class LiveReconstruction:
             since = time.monotonic()
             while process.code is None and time.monotonic() - since < _CLOSE:  # its output ends before it does
                 time.sleep(_POLL)
-            when = "in the middle of the scan" if self._ready.is_set() else "before it was ready"
+            when = "during the scan" if self._ready.is_set() else "before it was ready"
             if killed := process.code is not None and process.code < 0 and self._again > 0:
                 self._again -= 1
-                then = "It is started again, and takes up the views in the file."
+                then = "It is started again, and uses the projections in the file."
             else:
                 self.ended = True
-                then = "The scan goes on without it. To start another: beamline recon FILE --follow -o OUT.h5"
-            message = f"The live reconstruction has ended {when} (code {process.code}); see {self._log.name}. {then}"
+                then = "The scan continues without it. To start another one: beamline recon FILE --follow -o OUT.h5"
+            message = f"The live reconstruction ended {when} (code {process.code}). See {self._log.name}. {then}"
             self._sink(Warned(message, source="recon"))
             if killed:
                 self._start("a")

@@ -265,7 +265,7 @@ class Measurement:
             acquisition.wait_while_paused(reopen=False)
             return wait_in_pause(recorder)
 
-        cone = "" if ready.info.source_distance_mm is None else "the beam is a cone, in which no gain is predicted"
+        cone = "" if ready.info.source_distance_mm is None else "improvements are not predicted for a cone beam"
         ended = "no live reconstruction is running"
         decider.why_no_law = lambda: cone or (ended if follower is None or follower.ended else "")
         decider.record, decider.wait_a_moment = recorder.add_decision, wait_a_moment
@@ -283,10 +283,10 @@ class Measurement:
         if not faults or self.config.references.on_fault == "log":
             return None
         return (
-            f"Stopped before the first projection, because the references cannot be used. {' '.join(faults.values())} "
-            f"The shutter was asked to close; the {recorder.n_frames} darks and flats are in the file. Mend this, look "
-            "at a few frames and the exposure with `beamline tune`, and scan again; references.on_fault: log takes the "
-            "scan as it is."
+            "Stopped before the first projection, because the darks or flats cannot be used. "
+            f"{' '.join(faults.values())} The shutter was told to close; the {recorder.n_frames} darks "
+            "and flats are in the file. Fix this, check a few frames and the exposure with `beamline "
+            "tune`, and start the scan again. To scan anyway, set references.on_fault: log."
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
@@ -297,12 +297,13 @@ class Measurement:
         if len(chosen) < n_bad:
             self.sink(
                 Warned(
-                    f"{n_bad} views were flagged or gave no frame, and {len(chosen)} may be taken again "
-                    f"(monitor.retake_share): {n_bad - len(chosen)} between them stay as they are."
+                    f"{n_bad} projections were flagged or gave no frame, but only {len(chosen)} may be "
+                    f"taken again (monitor.retake_share). The other {n_bad - len(chosen)} remain as they "
+                    "are."
                 )
             )
         recorder.expect_more(len(chosen), self.ready.timeline.retake_seconds * len(chosen) / self.ready.plan.retakes)
-        self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'view')} again")
+        self.states.enter(State.ACQUIRING, f"Taking {count(len(chosen), 'projection')} again")
         return chosen
 
     def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:

@@ -78,8 +78,9 @@ class DryRun:
         if each := self.energies:
             seconds = sum(need.duration for need in each)
             sentence = (
-                f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, a scan like this of each: "
-                f"{hms_text(seconds)} and {size(self.total_bytes)} in all (without the monochromator's moves)"
+                f"{len(each)}, {each[0].kev:.7g} to {each[-1].kev:.7g} keV, one such scan at each: "
+                f"{hms_text(seconds)} and {size(self.total_bytes)} in total (without the moves of the "
+                "monochromator)"
             )
             lines.append(f"{'energies':<10}{sentence}")
         return lines
@@ -131,12 +132,14 @@ def _doubt_optics(config: Config) -> str:
     half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]  # mm, of the field
     if optics.pixel_size_um > _DEMAGNIFIED * own:
         return (
-            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, the camera's pixels are {own:g} um: the field would "
-            f"be {2 * half:.4g} mm wide. It is the size of an unbinned pixel at the sample; is it in nm?"
+            f"optics.pixel_size_um is {optics.pixel_size_um:g} um, but the camera's pixels are {own:g} "
+            f"um: the field of view would be {2 * half:.4g} mm wide. The setting is the size of an "
+            "unbinned pixel at the sample; is it in nm?"
         )
     return (
-        f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the field of "
-        f"{2 * half:.4g} mm: a sample that fills it could not turn there. Is it in m?"
+        f"optics.distance_mm is {optics.distance_mm:g} mm from sample to detector, less than half the "
+        f"field of view of {2 * half:.4g} mm: a sample that fills the field could not rotate there. Is it "
+        "in m?"
         if optics.distance_mm and optics.distance_mm < half
         else ""
     )
@@ -181,8 +184,8 @@ def _of_energies(each: Sequence[DryRun]) -> DryRun:
     violations = dict.fromkeys(limit for one in each for limit in one.timeline.violations)
     if total.total_bytes * ROOM > total.free_bytes:
         violations[
-            f"{len(each)} energies need {size(total.total_bytes)} and a tenth more, the disk has "
-            f"{size(total.free_bytes)} free; free some, choose another storage.folder, or name fewer energies"
+            f"free some space, choose another storage.folder, or set fewer energies: {len(each)} energies "
+            f"need {size(total.total_bytes)} plus a tenth, and the disk has {size(total.free_bytes)} free"
         ] = None
     return replace(total, timeline=replace(total.timeline, violations=tuple(violations)))
 
@@ -214,9 +217,9 @@ def refuse_violations(worked: Timeline) -> None:
     """Raise ConfigError with all violated limits, if there are any."""
     broken = worked.violations
     if len(broken) == 1:
-        raise ConfigError(f"a limit is violated, nothing was started: {broken[0]}.")
+        raise ConfigError(f"a limit is exceeded, nothing was started: {broken[0]}.")
     if broken:
-        raise ConfigError("\n  ".join([f"{len(broken)} limits are violated, nothing was started:", *broken]))
+        raise ConfigError("\n  ".join([f"{len(broken)} limits are exceeded, nothing was started:", *broken]))
 
 
 def disk_of(folder: Path) -> Path:
@@ -227,12 +230,15 @@ def disk_of(folder: Path) -> Path:
     """
     folder = folder.absolute()
     if link := broken_link(folder):
-        raise ConfigError(f"runs cannot be written to {folder}: {link} Choose another folder; nothing was started.")
+        raise ConfigError(
+            f"choose another folder, because runs cannot be written to {folder}: {link} Nothing was started."
+        )
     there = next((place for place in (folder, *folder.parents) if place.exists()), None)
     if there is None or not there.is_dir():
         problem = "no such disk" if there is None else f"a file at {there}"
         raise ConfigError(
-            f"runs cannot be written to {folder}: there is {problem}. Choose another folder; nothing was started."
+            f"choose another folder, because runs cannot be written to {folder}: there is {problem}. "
+            "Nothing was started."
         )
     return there
 

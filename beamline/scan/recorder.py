@@ -157,7 +157,10 @@ class Recorder:
         if not self._unjudged:
             return ""
         frames = f"{count(len(self._unjudged), 'frame')} ({spans(self._unjudged)})"
-        return f"The monitor did not look at {frames}: they have no flags. `beamline monitor {self._writer.path}` does."
+        return (
+            f"The monitor did not check {frames}: they have no flags. `beamline monitor {self._writer.path}` "
+            "checks them."
+        )
 
     def expect_more(self, n: int, seconds: float) -> None:
         """Announce frames beyond the timeline; may be called while no frame waits."""
@@ -183,7 +186,7 @@ class Recorder:
 
     def _refuse_stall(self) -> None:
         if time.monotonic() - self._writing_since > STALL:
-            raise DataError(f"The disk took no frame for {STALL:g} s: check it. {self._safe()}")
+            raise DataError(f"Check the disk: it accepted no frame for {STALL:g} s. {self._safe()}")
 
     def _raise_failure(self) -> None:
         cause = self._failure
@@ -250,8 +253,8 @@ class Recorder:
             self._monitor_off = self._alone = True
         self._sink(
             Warned(
-                f"The check {self._check_name} has not come back from frame {frame.index} for {seconds:.0f} s. The "
-                "monitor is off: frames from here on are stored without flags."
+                f"The monitor is off: its check {self._check_name} has not finished frame {frame.index} "
+                f"for {seconds:.0f} s. From here on frames are stored without flags."
             )
         )
         self._checked.put(self._digested(frame))

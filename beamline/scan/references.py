@@ -40,7 +40,7 @@ class ReferenceLog:
             planned: blocks that are over by now; references without any frame are missing.
         """
         missing = {
-            block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the views did not come."
+            block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the projections were not taken."
             for block in planned
             if block.kind in REFERENCES and not self.evidence.of_kind(block.kind)
         }
@@ -60,10 +60,11 @@ class ReferenceLog:
         if not found < FEW_PHOTONS:
             return None
         return (
-            f"Too little light: in the views a pixel of the open beam has {found:.3g} photons, by mean and variance of "
-            f"the flats {spans([flat.row for flat in flats])}; expected {FEW_PHOTONS} or more, else noise rules the "
-            f"volume. Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / found:.2g}, and scan.period_s to "
-            "match), or bin the camera's pixels (devices.camera.binning). `beamline tune` measures it."
+            f"Expose for longer (scan.exposure_s={exposure * FEW_PHOTONS / found:.2g}, and scan.period_s "
+            "to match), or bin the camera's pixels (devices.camera.binning): the beam is too weak. A "
+            f"pixel of the open beam has {found:.3g} photons per projection (from mean and variance of "
+            f"the flats {spans([flat.row for flat in flats])}); expected {FEW_PHOTONS} or more, otherwise "
+            "noise dominates the volume. `beamline tune` measures it."
         )
 
 

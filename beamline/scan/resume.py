@@ -90,13 +90,13 @@ class ResumableRun:
         if self.end_references is not None:
             kinds = ["offset views"] if self.offset_missing else []
             kinds += [f"{kind.name.lower()}s" for kind in sorted(self.end_references)]
-            all_views = "the views that it was to take" if self.choices else f"{self.planned} views"
+            all_views = "the projections that it was to take" if self.choices else f"{self.planned} views"
             return (
-                f"Preparing: {self.run} has all {all_views}, its missing {' and '.join(kinds)} of the end are taken now"
+                f"Preparing: {self.run} has all {all_views}; its missing {' and '.join(kinds)} of the end are taken now"
             )
         if self.choices:  # some views were decided against, or are taken twice
-            return f"Preparing: {self.run} lacks {missing} of the views that it was to take, which are taken now"
-        return f"Preparing: {self.run} has {len(self.views)} of {self.planned} views, {missing} are taken"
+            return f"Preparing: {self.run} lacks {missing} of the projections that it was to take; they are taken now"
+        return f"Preparing: {self.run} has {len(self.views)} of {self.planned} projections; {missing} are taken now"
 
     def remaining(self, plan: ScanPlan) -> ScanPlan:
         """The part of the plan that is still missing."""
@@ -168,12 +168,12 @@ def _alone(run: Path) -> Iterator[WriterLock]:
         lock = WriterLock(run / EVENTS, exclusive=True)
     except OSError as error:
         raise ConfigError(
-            f"{run} cannot be held ({error.strerror}): another process goes on with it or recovers it, or it cannot be "
-            f"written to. {_UNTOUCHED}"
+            f"{run} cannot be locked ({error.strerror}): another process is continuing or recovering it, "
+            f"or it is write-protected. {_UNTOUCHED}"
         ) from None
     try:
         if alive(parts_of(run)[-1]):
-            raise ConfigError(f"The scan of {run} still runs: wait for its end, or stop it. {_UNTOUCHED}")
+            raise ConfigError(f"The scan of {run} is still running: wait until it ends, or stop it. {_UNTOUCHED}")
         yield lock
     finally:
         lock.release()
@@ -182,8 +182,8 @@ def _alone(run: Path) -> Iterator[WriterLock]:
 def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
     if is_ride(run):
         raise ConfigError(
-            f"{run} is a ride on the scan of another program, which cannot be continued here: `beamline ride` records "
-            f"the next one in a new run. {_UNTOUCHED}"
+            f"{run} recorded the scan of another program, which cannot be continued here. `beamline ride` "
+            f"records the next scan in a new run. {_UNTOUCHED}"
         )
     files, left_out = _files(run)
     config = load(run / CONFIG, environment={})
@@ -197,7 +197,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
                 if other is not None:
                     require_same_config(run, file["/entry/record/config"].asstr()[()], other)
             if not (angles := views_planned(file)):
-                raise DataError(f"{part} has no plan, so that its missing views are unknown. {_UNTOUCHED}")
+                raise DataError(f"The missing projections are unknown, because {part} has no plan. {_UNTOUCHED}")
             planned = angles
             if file[layout.COMMITTED][()]:
                 table = frames_in(file)  # a damaged one is named
@@ -207,7 +207,7 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
                 numbers = table.triggers[table.views]
                 retaken += int((numbers >= planned).sum())  # which count on from those of the plan
     if not parts:
-        raise NoFrame(f"{run} has no frame: run the scan anew. {_UNTOUCHED}")
+        raise NoFrame(f"{run} has no frame: start the scan again. {_UNTOUCHED}")
     with ExitStack() as opened, hdf5.readable(run):
         each = [opened.enter_context(hdf5.open_hdf5(part)) for part in parts]
         missing, choices, due = still_to_take(each)
@@ -225,11 +225,11 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
 
 def _refuse_whole(run: Path, parts: list[Path], closed: bool) -> None:
     """Raise NothingMissing, or NotJoined where a file of a run with all its frames was not closed or joined."""
-    whole = f"{run} has all views that it was to take, and its references"
+    whole = f"{run} has all projections that it was to take, and its darks and flats"
     if closed and (len(parts) == 1 or is_joined(run / JOINED)):
         raise NothingMissing(f"{whole}: nothing is missing. {_UNTOUCHED}")
-    what = f"{JOINED} does not have those of its {len(parts)} parts" if closed else "a file was not closed"
-    raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` mends that. {_UNTOUCHED}")
+    what = f"{JOINED} does not have the frames of its {len(parts)} parts" if closed else "a file was not closed"
+    raise NotJoined(f"{whole}, but {what}: `beamline recover {run}` fixes that. {_UNTOUCHED}")
 
 
 def _files(run: Path) -> tuple[list[Path], list[str]]:
@@ -237,7 +237,9 @@ def _files(run: Path) -> tuple[list[Path], list[str]]:
     these."""
     files = files_with_frames(run)
     empty = [part / SCAN for part in parts_of(run) if (part / SCAN).is_file() and part / SCAN not in files]
-    return files, [f"{scan} is left out: no frame can be read in it, and its {EVENTS} names none." for scan in empty]
+    return files, [
+        f"{scan} is left out, because none of its frames can be read and its {EVENTS} lists none." for scan in empty
+    ]
 
 
 def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN) -> None:
@@ -247,17 +249,19 @@ def require_same_config(run: Path, stored: str, other: Config, name: str = SCAN)
     before, now = stored.splitlines()[1:], resolved_yaml(other).splitlines()[1:]
     differ = next(((a.strip(), b.strip()) for a, b in zip(before, now, strict=False) if a != b), None)
     if differ is not None or len(before) != len(now):
-        difference = " `{}`, not `{}`,".format(*differ) if differ else ""
+        difference = " `{}` instead of `{}`".format(*differ) if differ else ""
         raise ConfigError(f"{run} was taken with another configuration:{difference} in its {name}. {_UNTOUCHED}")
 
 
 def _require_same_instrument(run: Path, stored: h5py.File, ready: ReadyScan) -> None:
     if stored["/entry/record/plan"].asstr()[()] != ready.info.plan:
-        raise ConfigError(f"{run} was planned with other angles: has their file changed? {_UNTOUCHED}")
+        raise ConfigError(f"{run} was planned with other angles: was the angle file changed? {_UNTOUCHED}")
     if (frames := stored[layout.DATA].shape[1:]) != tuple(ready.timing.shape):
-        raise ConfigError(f"{run} has frames of {frames} pixels, the camera gives {ready.timing.shape}. {_UNTOUCHED}")
+        raise ConfigError(
+            f"{run} has frames of {frames} pixels, but the camera gives {ready.timing.shape}. {_UNTOUCHED}"
+        )
     for device, before, now in _devices_differing(stored, ready):
-        raise ConfigError(f"{run} was taken with another {device}: {before}; now there is {now}. {_UNTOUCHED}")
+        raise ConfigError(f"{run} was taken with another {device}: {before}; now it is {now}. {_UNTOUCHED}")
 
 
 def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[str, str, str]]:

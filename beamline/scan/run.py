@@ -75,7 +75,8 @@ def run_scan(
     """
     if config.scan.energies is not None:
         raise ConfigError(
-            "scan.energies lists several scans, but this call runs one: set scan.energy. Nothing was started."
+            "set scan.energy instead of scan.energies, which lists several scans: this call runs one "
+            "scan. Nothing was started."
         )
     began = time.monotonic()
     stop = stop or StopRequest()
@@ -157,7 +158,7 @@ def _announcing(
     sink = fan_out(*map(stack.enter_context, announcers))
     for device, description in ready.info.devices.items():
         if settings := description.get(FOUND):
-            sink(Warned(f"{device}: before it was opened: {settings}."))
+            sink(Warned(f"{device}: settings before it was opened: {settings}."))
     return sink
 
 
@@ -171,9 +172,7 @@ def _logs(config: Config, ready: ReadyScan, folder: Path, stack: ExitStack) -> t
         log = stack.enter_context(new_log(folder / USER_LOG))
         events = stack.enter_context(new_log(folder / EVENTS))
     except OSError as error:
-        raise DataError(
-            f"{folder} cannot be written to ({error.strerror}). Nothing has moved or was acquired."
-        ) from error
+        raise DataError(f"{folder} cannot be written to ({error.strerror}). Nothing was moved or taken.") from error
     return record_sink(record), JsonLines(events), UserLog(log)
 
 
@@ -185,7 +184,7 @@ def _named(config: Config) -> str:
 def _refuse_stop(stop: StopRequest) -> None:
     """Raise ScanAborted if a stop was requested: before anything moves, a stop is an abort."""
     if stop.stopping:
-        raise ScanAborted(f"Interrupted before the first frame: {stop.reason}. Nothing has moved.")
+        raise ScanAborted(f"Interrupted before the first frame: {stop.reason}. Nothing was moved.")
 
 
 def _to_its_end(
@@ -228,6 +227,15 @@ def _set_aside(files: Sequence[Path], part: str, states: StateMachine, sink: Sin
         aside = path.with_stem(f"{path.stem}.before-{part}")
         try:
             path.rename(aside)
-            sink(StateEntered(states.state, f"{path.name}, of the views before, is {aside.name} now"))
+            sink(
+                StateEntered(
+                    states.state, f"{path.name}, the volume of the earlier projections, was renamed to {aside.name}"
+                )
+            )
         except OSError as error:  # Windows, where a viewer holds it open
-            sink(Warned(f"{path} could not be renamed ({error.strerror}): there is no volume of all parts of the run."))
+            sink(
+                Warned(
+                    f"There is no volume of all parts of the run, because {path} could not be renamed "
+                    f"({error.strerror})."
+                )
+            )

@@ -73,7 +73,7 @@ def newest(folder: Path) -> Path:
     """The folder of the scan that is running, else of the newest run. Raises ConfigError if there is no run."""
     candidates = running(folder)[-1:] or runs_in(folder)
     if not candidates:
-        raise ConfigError(f"There is no run in {folder}. Name the folder of a run, or a scan file.")
+        raise ConfigError(f"{folder} contains no run. Name the folder of a run, or a scan file.")
     return candidates[0]
 
 

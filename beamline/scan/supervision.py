@@ -82,8 +82,9 @@ class BeamGuard:
                 return
             self._paused = True
             self._pause.no_beam(
-                f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than {self._pause_below:.4g}. The "
-                f"scan goes on by itself when it has read {self._resume_above:.4g} again for {self._settle:g} s",
+                f"the beam monitor reads {reading.value:.4g} {reading.unit}, less than "
+                f"{self._pause_below:.4g}. The scan continues automatically after the reading has been at "
+                f"least {self._resume_above:.4g} for {self._settle:g} s",
                 self._good,
             )
         if reading.value < self._resume_above:

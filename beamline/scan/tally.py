@@ -18,9 +18,9 @@ NAMED = 5  # views that a sentence names
 DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
 TRIES = 3  # exposures of a view whose stage is not at its angle, after which the view counts as missing
 ASTRAY_ADVICE = (
-    f"Such a frame is kept as an invalid row, and its view is taken again, up to {TRIES} times in all. Look for "
-    "another program or person that moves the stage, a knob, a servo that hunts, or a controller that says too early "
-    "that a move is done"
+    f"Such a frame is kept as an invalid row, and its projection is taken again, up to {TRIES} times in "
+    "total. Possible causes are another program or person that moves the stage, its manual knob, a servo "
+    "that oscillates, or a controller that reports the end of a move too early"
 )
 
 Exposed = tuple[CameraFrame, int, float, bool]
@@ -92,13 +92,14 @@ def recover(done: Iterable[BlockTally], triggers: Collection[int]) -> int:
 def astray_views(taken: BlockTally) -> str:
     """A sentence on frames exposed while the stage was not at its angle, and where it was."""
     where = [
-        f"view {trigger} at {math.degrees(float(taken.block.angles[trigger])):.4g}°: {math.degrees(places[-1][1]):.4f}°"
+        f"projection {trigger} at {math.degrees(float(taken.block.angles[trigger])):.4g}°: "
+        f"{math.degrees(places[-1][1]):.4f}°"
         for trigger, places in list(taken.astray.items())[:NAMED]
     ]
     more = f", and {len(taken.astray) - NAMED} more" if len(taken.astray) > NAMED else ""
     return (
-        f"The stage was not at its angle in {sum(map(len, taken.astray.values()))} exposures of {len(taken.astray)} "
-        f"views ({', '.join(where)}{more}). {ASTRAY_ADVICE}."
+        f"The stage was not at its angle in {sum(map(len, taken.astray.values()))} exposures of "
+        f"{len(taken.astray)} projections ({', '.join(where)}{more}). {ASTRAY_ADVICE}."
     )
 
 
@@ -118,29 +119,30 @@ def _of_block(taken: BlockTally) -> str:
         text = f"{n} of {block.n} {noun}s {'is' if n == 1 else 'are'} missing: {spans(taken.missing)}{at}."
         if taken.lost:
             text += (
-                f" {taken.lost} were exposed but never delivered by the camera: "
-                "`beamline check --connect` looks at its link."
+                f" The camera exposed {taken.lost} of them but did not deliver them: `beamline check "
+                "--connect` checks its link."
             )
         if astray := sum(trigger in taken.astray for trigger in taken.missing):
             text += f" In {astray} of them the stage was not at its angle in any of {TRIES} exposures (invalid rows)."
         if taken.ignored:
-            text += f" {taken.ignored} triggers were ignored by the camera, which was not ready."
+            text += f" The camera ignored {taken.ignored} triggers, because it was not ready."
     if untriggered := taken.extra - taken.unconfirmed:
-        text += f" {untriggered} frames came without a trigger and are kept as invalid rows."
+        text += f" {untriggered} frames arrived without a trigger and are kept as invalid rows."
     if taken.unconfirmed:
         text += (
-            f" {taken.unconfirmed} frames came while the stage braked, whose angles neither their times nor the place "
-            "where it stands confirm. The cause is noise on the trigger line, or another deceleration than the "
-            "stage's. They are kept as invalid rows."
+            f" {taken.unconfirmed} frames arrived while the stage was braking, and are kept as invalid "
+            "rows. Their angles are not certain: neither the trigger times nor the final position of the "
+            "stage confirm them. Either the trigger line picks up noise, or the stage decelerates "
+            "differently from its configured value."
         )
     if taken.shift:
         text += (
-            f" The angles of a pass may all be wrong by up to {taken.shift} steps: it is not known at which of its "
-            "ends frames are missing or too many."
+            f" The angles of a pass may all be wrong by up to {taken.shift} steps, because it is not "
+            "known at which of its ends frames are missing or too many."
         )
     if text and taken.off > DOUBTFUL:
         text += (
-            f" A frame came {taken.off:.2f} periods off its trigger: its angle may be wrong by as much of a step "
-            "(warnings of `timing` name such frames)."
+            f" A frame arrived {taken.off:.2f} periods away from its trigger, so its angle may be wrong "
+            "by as much of a step (warnings of `timing` name such frames)."
         )
     return text.strip()

@@ -65,9 +65,7 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
         # A plan is of our own scans, whose angles are in degrees.
         yield Finding("warning" if scan.source.plan else "error", "angle-spread", text)
     elif (unseen := half_turn_unseen(angles)) > 0:
-        span_text = (
-            f"span {span:.2f} degrees, less than 180" if span + step < 180 else "do not cover 180 degrees"
-        )
+        span_text = f"span {span:.2f} degrees, less than 180" if span + step < 180 else "do not cover 180 degrees"
         yield Finding(
             "warning",
             "angle-spread",
