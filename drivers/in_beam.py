@@ -28,7 +28,7 @@ class StagePlaces:
 
     places: Mapping[str, float]
     speed: float
-    failed: str = "the filter did not come to"
+    failed: str = "the filter did not move to"
 
 
 class PlacedStage:
@@ -68,7 +68,7 @@ class PlacedStage:
                 raise
             stage.wait(POLL)
         except DeviceError as cause:
-            advice = cause.advice or "Look where it is before the next scan"
+            advice = cause.advice or "Check its position before the next scan"
             problem = f"{self._places.failed} {place}: {cause.device}: {cause.problem}"
             raise cause.told_by(self.name, problem, advice=advice) from cause
 
@@ -81,7 +81,7 @@ class PlacedStage:
                 return ""
             now, place = self._stage.position(), self.place()
             named = f" ({place})" if place else ""
-            return f"it stood at {math.degrees(before):.4f} deg, and is at {math.degrees(now):.4f} deg{named}"
+            return f"it was at {math.degrees(before):.4f} deg, and is now at {math.degrees(now):.4f} deg{named}"
 
         return moved
 
@@ -116,7 +116,7 @@ class StageSampleMover:
         self._motor.put(INSIDE, aside * self._rad_per_mm if aside else 0.0)
 
 
-NOT_KNOWN = "Whether the shutter is open is not known: look before anybody goes near the beam"
+NOT_KNOWN = "It is not known whether the shutter is open: check it before anybody goes near the beam"
 
 
 class OutputShutter:
@@ -184,7 +184,7 @@ class OutputShutter:
         if held is not None and held is not level:
             raise DeviceError(
                 self.name,
-                f"{self._output.name} is not at the level that was set",
+                f"{self._output.name} does not have the level that was set",
                 request="high" if level else "low",
                 reply="high" if held else "low",
                 expected=f"{'high' if level else 'low'}, which {'opens' if opened else 'closes'} the shutter",
@@ -253,8 +253,8 @@ class ManualSampleMover(_Manual):
 
     def back(self, aside: float = 0.0) -> None:
         if aside:
-            advice = "Name a stage that moves it (devices.sample_mover)."
-            raise DeviceError("sample mover", f"nobody moves it by hand {aside:g} mm aside", advice=advice)
+            advice = "Configure a stage that moves it (devices.sample_mover)."
+            raise DeviceError("sample mover", f"it cannot be moved {aside:g} mm sideways by hand", advice=advice)
         self._bring("in", "Move the sample back into the beam, to the same place.")
 
 

@@ -22,7 +22,7 @@ _REFUSALS = frozenset(
     )
 )
 """Errors for a value that a camera refuses, always or for now; the vendor's manuals disagree on their use."""
-_STATE = "No frame was taken with it; earlier frames are good"
+_STATE = "No frame was taken with this setting; earlier frames are good"
 
 
 class Properties:
@@ -68,7 +68,7 @@ class Properties:
             if error.code not in _REFUSALS:
                 raise
             reply = codes.error_name(error.code)
-            raise self._refused(f"it refuses {prop.name} = {value:g}", prop, value, reply) from error
+            raise self._refused(f"it does not accept {prop.name} = {value:g}", prop, value, reply) from error
         return self.get(prop)
 
     def set_exactly(self, prop: Property, value: float) -> None:
@@ -92,7 +92,7 @@ class Properties:
                 request=f"{prop.name} = {value:g}",
                 reply=f"{accepted:g}",
                 expected=f"{value:g} within {tolerance:g}",
-                advice="Ask for a value that the camera has, or allow a larger exposure_tolerance",
+                advice="Choose a value that the camera has, or a larger exposure_tolerance",
                 state=_STATE,
             )
 
@@ -119,8 +119,8 @@ class Properties:
             problem,
             request=f"{prop.name} = {value:g}",
             reply=reply,
-            expected=f"another value, legal: {self._legal(prop)}",
-            advice="Choose one of them in the configuration",
+            expected=f"another value; allowed: {self._legal(prop)}",
+            advice="Choose one of the allowed values in the configuration",
             state=_STATE,
         )
 
@@ -189,7 +189,7 @@ def _status(properties: Properties) -> Cooler:
 
 def _target(properties: Properties) -> str:
     target = properties.find(Property.SENSORTEMPERATURETARGET)
-    return "the cooler to be ready" if target is None else f"{target:.1f} °C"
+    return "the cooler to become ready" if target is None else f"{target:.1f} °C"
 
 
 def _steady(history: list[tuple[float, float]]) -> bool:

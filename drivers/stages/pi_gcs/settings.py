@@ -60,7 +60,7 @@ def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
     step = max(abs(train.interval), 2) if alone else abs(train.interval)
     if first_pulse is PiFirstPulse.GRID and train.start % step:
         raise ValueError(
-            f"this controller gives pulses only at whole multiples of {step} counts, and {train.start} is none"
+            f"this controller sends pulses only at integer multiples of {step} counts, and {train.start} is not one"
         )
     before = {PiFirstPulse.AT_THRESHOLD: Fraction(0), PiFirstPulse.STEP_AFTER: Fraction(step)}
     lead = before.get(first_pulse, Fraction(step, 2))
@@ -107,17 +107,23 @@ class PiGcsSettings(Wiring, StageFigures):
     """
 
     axis: str = setting("1", "1 to 16 letters, digits and _", pattern=AXIS_NAME)
-    serial: str | None = setting(None, "Its serial number, as in *IDN?: another device is refused; null: any is taken.")
-    trigger_line: int = setting(1, "Digital output that the trigger pulses come from.", gt=0)
-    reference: Reference = setting(Reference.SWITCH, "What the search for the reference goes to.")
+    serial: str | None = setting(
+        None,
+        "Its serial number, as in *IDN?; the driver stops with an error if another device answers. null: accept any.",
+    )
+    trigger_line: int = setting(1, "Digital output of the trigger pulses.", gt=0)
+    reference: Reference = setting(Reference.SWITCH, "Switch at which the search for the reference ends.")
     first_pulse: PiFirstPulse = setting(
         PiFirstPulse.AT_THRESHOLD,
-        "Where the firmware puts a train's first pulse; not documented, to be found out once (docs/hardware.md).",
+        "Where the firmware puts the first pulse of a train. This is not documented; measure it once "
+        "(docs/hardware.md).",
     )
-    firmware_pulse: float = setting(50e-6, "How long the firmware holds a pulse.", unit="s", gt=0)
-    tolerance: int = setting(10, "From the target, within which a move has arrived.", unit="counts", ge=0)
+    firmware_pulse: float = setting(50e-6, "Pulse width of the firmware.", unit="s", gt=0)
+    tolerance: int = setting(
+        10, "Largest distance from the target at which a move counts as arrived.", unit="counts", ge=0
+    )
     settle: float = setting(
-        1.0, "After a move, in which the controller may still bring the axis on target.", unit="s", ge=0
+        1.0, "Wait after a move, during which the controller may still settle on the target.", unit="s", ge=0
     )
 
     def __post_init__(self) -> None:

@@ -19,8 +19,8 @@ from drivers.stages.zaber.axis import INTERRUPTED, LOST, SLIPPED, WHOLE, ZaberAx
 from drivers.stages.zaber.settings import ZaberSettings, set_up
 
 ADVICE = (
-    "Firmware without `schedule` needs toggle; firmware whose actions enable no triggers needs chained: false, and "
-    "room for one step before the first pulse"
+    "Firmware without `schedule` needs toggle. Firmware whose actions cannot enable triggers needs "
+    "chained: false, and room for one step before the first pulse"
 )
 
 
@@ -117,12 +117,12 @@ class ZaberStage(LineStage):
             self._told = frozenset(status.flags)
             raise DeviceError(
                 self.name,
-                f"a fault at {aim}" if arrived else f"it stopped short of {aim}",
+                f"a fault at {aim}" if arrived else f"it stopped before it reached {aim}",
                 request=self._axis.last_move,
                 reply=status.raw,
-                expected=f"to stand at {aim} without a fault",
-                advice="Find what stopped it before moving on" if fault is None else fault.advice,
-                state=f"It stands at {self._travel.degrees(status.counts)}, {status.counts} counts: "
+                expected=f"to be at {aim} without a fault",
+                advice="Find what stopped it before you move it again" if fault is None else fault.advice,
+                state=f"It is at {self._travel.degrees(status.counts)}, {status.counts} counts: "
                 + ("no reason given" if fault is None else fault.text),
             )
         self._searching = False
@@ -193,9 +193,9 @@ class ZaberStage(LineStage):
             self.name,
             f"the stage was disturbed since its last move: {fault.text}",
             reply=status.raw,
-            expected="a stage that stood still",
-            advice=f"{fault.advice}. What was measured since then may have been at another angle",
-            state=f"Nothing has moved by this; it stands at {self._travel.degrees(status.counts)}",
+            expected="a stage at rest",
+            advice=f"{fault.advice}. Frames since then may have been taken at another angle",
+            state=f"This has moved nothing; the stage is at {self._travel.degrees(status.counts)}",
         )
 
     def _forget_flags(self, status: ZaberAxisStatus) -> None:
