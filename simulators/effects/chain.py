@@ -84,7 +84,7 @@ class Chain:
         for i, effect in enumerate(effects):
             for earlier in effects[:i]:
                 if earlier.name == effect.name:
-                    raise ValueError(f"effect {effect.name!r} is named twice")
+                    raise ValueError(f"effect {effect.name!r} is given twice")
                 if earlier.domain > effect.domain:
                     raise ValueError(
                         f"effect {effect.name!r} acts on {effect.domain.words} and cannot follow {earlier.name!r}, "

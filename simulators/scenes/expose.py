@@ -92,7 +92,7 @@ class Scan:
             IndexError: there is no such frame.
         """
         if not 0 <= number < len(self):
-            raise IndexError(f"frame {number} is not one of the scan's 0 ... {len(self) - 1}")
+            raise IndexError(f"frame {number} is not in the scan, which has 0 ... {len(self) - 1}")
         settings, scan = self.scene.detector, self.scene.scan
         view = number - scan.darks - scan.flats
         beam, sample = number >= scan.darks, view >= 0

@@ -147,7 +147,7 @@ class SimulatedSerial(SerialBase):  # type: ignore[misc]  # pyserial carries no 
             if self._name not in _WIRES:
                 known = ", ".join(SCHEME + known for known in sorted(_WIRES)) or "none"
                 raise SerialException(
-                    f"could not open port {SCHEME}{self._name}: no such simulated port; there are {known}"
+                    f"could not open port {SCHEME}{self._name}: there is no such simulated port, only {known}"
                 )
             self._wire = _OPEN[self._name] = _WIRES[self._name]
         self._wire.transmit()  # opening a port drops earlier bytes, as an operating system does

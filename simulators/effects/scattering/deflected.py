@@ -84,7 +84,9 @@ class Floaters(ImageEffect, Anomaly):
             if not least <= most:
                 raise ValueError(f"{name} must be [least, most] in mm, got {[least, most]}")
         if self.motion == "loose" and self.views is None:
-            raise ValueError("loose floaters need views, [first, one after the last], between which they pass the axis")
+            raise ValueError(
+                "loose floaters need views, [first, one after the last], between which they cross the axis"
+            )
 
     def apply(self, image: Image, shot: Shot) -> Image:
         for crumb in self.crumbs(shot):

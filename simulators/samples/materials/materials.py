@@ -149,7 +149,9 @@ class Material:
             raise ValueError(f"{self.name}: edge_shift_ev must lie in -20 ... 20 eV, got {self.edge_shift_ev}")
         if not K_EDGES.keys() & dict(self.fractions).keys():
             symbols = ", ".join(xraylib.AtomicNumberToSymbol(z) for z in K_EDGES)
-            raise ValueError(f"{self.name}: state_of_charge is for an oxide with {symbols}; this has none of them")
+            raise ValueError(
+                f"{self.name}: state_of_charge is for an oxide with {symbols}; this material has none of them"
+            )
 
     def attenuation(self, energies: ArrayLike) -> Reals:
         """Linear attenuation in 1/mm at `energies` in keV, float64, of their shape.

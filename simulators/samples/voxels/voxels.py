@@ -90,9 +90,9 @@ class Voxels:
             if thresholds:
                 raise ValueError("labels come from thresholds or from a volume, not from both")
             if labels.shape != attenuation.shape:
-                raise ValueError(f"labels of shape {labels.shape} do not go with a volume of {attenuation.shape}")
+                raise ValueError(f"labels of shape {labels.shape} do not match a volume of {attenuation.shape}")
             if not np.issubdtype(labels.dtype, np.integer):
-                raise ValueError(f"labels must be whole numbers, got {labels.dtype}")
+                raise ValueError(f"labels must be integers, got {labels.dtype}")
             low, n = int(labels.min()), int(labels.max())
             if not 0 <= low <= n <= MOST_LABELS:
                 raise ValueError(f"labels must be 0 ... {MOST_LABELS}, got {low} ... {n}")
@@ -136,8 +136,9 @@ class Voxels:
         nearest = float((along @ corners.T - np.einsum("ri,ri->r", along, origin)[:, None]).min())
         if not nearest > -sod:
             raise CannotExposeError(
-                f"the volume begins {-nearest:.3g} mm before the rotation axis, the source {sod:g} mm before it; "
-                "it must lie wholly in front of the source. Raise sod, or make voxel_mm smaller. No frame was computed"
+                f"the volume begins {-nearest:.3g} mm in front of the rotation axis, and the source is "
+                f"{sod:g} mm in front of it. All of the volume must be between source and detector: "
+                "increase sod, or make voxel_mm smaller. No frame was computed"
             )
 
     def attenuation(self, grid: Grid, supersample: int = 3) -> NDArray[np.float32]:
@@ -317,6 +318,6 @@ def _factor(values: NDArray[np.float32], spacing: tuple[float, float, float], se
         poses = (Pose.turned(k * math.pi / VIEWS, planes).shifted_by(shift) for k in range(VIEWS))
         most = max(float(whole.line_integrals(pose, detector).max()) for pose in poses)
         if not most > 0:
-            raise ValueError(f"largest_line_integral needs matter; the largest sum is {most:g}")
+            raise ValueError(f"largest_line_integral needs a sample that absorbs; the largest sum is {most:g}")
         return settings.largest_line_integral / most
     return 1.0

@@ -57,7 +57,7 @@ class Foam(PieceBuilder):
 
     def __post_init__(self) -> None:
         if not self.largest_um >= self.smallest_um:
-            raise ValueError(f"holes go from largest_um down to smallest_um, got {self.largest_um}, {self.smallest_um}")
+            raise ValueError(f"largest_um must be at least smallest_um, got {self.largest_um}, {self.smallest_um}")
         check_roles(self)
 
     @property

@@ -142,7 +142,7 @@ class Charge:
 
     def at(self, pieces: Sequence[Piece], seconds: float) -> tuple[Piece, ...]:
         if self.role not in {piece.role for piece in pieces}:
-            raise ValueError(f"role: {self.role!r} is no part of this phantom")
+            raise ValueError(f"role: {self.role!r} is not a part of this phantom")
         moments = self.from_s + self.over_s * np.random.default_rng(self.seed).uniform(size=len(pieces))
         done = 0.5 * (1 + np.tanh((seconds - moments) / self.each_s / 2))
         return tuple(
