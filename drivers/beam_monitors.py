@@ -134,12 +134,10 @@ class PageSource:
             error.close()
             raise self._error(DeviceError, f"the server answered {error.code} {error.reason}") from error
         except TimeoutError as error:
-            raise self._error(DeviceTimeout, f"the complete page did not arrive within {self._timeout:g} s") from error
+            raise self._error(DeviceTimeout, f"no whole page within {self._timeout:g} s") from error
         except urllib.error.URLError as error:
             if isinstance(error.reason, TimeoutError):
-                raise self._error(
-                    DeviceTimeout, f"the complete page did not arrive within {self._timeout:g} s"
-                ) from error
+                raise self._error(DeviceTimeout, f"no whole page within {self._timeout:g} s") from error
             raise self._error(DeviceError, f"the page cannot be read ({error.reason})") from error
         except (OSError, http.client.HTTPException) as error:
             raise self._error(DeviceError, f"the page cannot be read ({error or type(error).__name__})") from error

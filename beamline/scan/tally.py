@@ -119,18 +119,18 @@ def _of_block(taken: BlockTally) -> str:
         text = f"{n} of {block.n} {noun}s {'is' if n == 1 else 'are'} missing: {spans(taken.missing)}{at}."
         if taken.lost:
             text += (
-                f" The camera exposed {taken.lost} of them but did not deliver them: `beamline check "
-                "--connect` checks its link."
+                f" {taken.lost} were exposed but never delivered by the camera: "
+                "`beamline check --connect` looks at its link."
             )
         if astray := sum(trigger in taken.astray for trigger in taken.missing):
             text += f" In {astray} of them the stage was not at its angle in any of {TRIES} exposures (invalid rows)."
         if taken.ignored:
-            text += f" The camera ignored {taken.ignored} triggers, because it was not ready."
+            text += f" {taken.ignored} triggers were ignored by the camera, which was not ready."
     if untriggered := taken.extra - taken.unconfirmed:
-        text += f" {untriggered} frames arrived without a trigger and are kept as invalid rows."
+        text += f" {untriggered} frames came without a trigger and are kept as invalid rows."
     if taken.unconfirmed:
         text += (
-            f" {taken.unconfirmed} frames arrived while the stage was braking, and are kept as invalid "
+            f" {taken.unconfirmed} frames came while the stage braked, and are kept as invalid "
             "rows. Their angles are not certain: neither the trigger times nor the final position of the "
             "stage confirm them. Either the trigger line picks up noise, or the stage decelerates "
             "differently from its configured value."

@@ -79,12 +79,12 @@ TELNET = re.compile("\xff[\xf0-\xfe]")  # the beginning of its negotiation
 _FOREIGN = (  # searched in the URL, a line end, and what was heard
     (
         f"^socket:.*{TELNET.pattern}",  # on a serial line it is noise
-        "the server uses Telnet (FF starts its negotiation)",
+        "the server speaks Telnet (FF starts its negotiation)",
         "Set this port of the terminal server to raw TCP: no Telnet, no RFC 2217",
     ),
     (
         r"\b(login|user ?name|password) ?:",
-        "the server asks for a login",
+        "a login is asked for",
         "Set this port of the terminal server to raw TCP, without a login",
     ),
     (
@@ -94,12 +94,12 @@ _FOREIGN = (  # searched in the URL, a line end, and what was heard
     ),
     (
         r"already in use|(port|line) is (in use|busy)|too many (clients|connections|sessions)",
-        "another client uses the server's port",
+        "another client holds the server's port",
         "Close the other program, or configure the server to accept a second client",
     ),
     (
         rf"\n.*{NO_TEXT.pattern}",
-        "it contains bytes that are not text",
+        "it has bytes that are no text",
         "Check the baud rate, the cable, and that the device is set to a text protocol",
     ),
 )

@@ -167,9 +167,9 @@ def try_out(name: str, device: str) -> None:
         *_, last = process.communicate(timeout=STARTS_WITHIN)[1].decode(errors="replace").splitlines() or [""]
         if process.returncode == _SURVIVED:
             return
-        how = f"ends the process that loads it (code {process.returncode}{last and ', '}{last})"
+        how = f"ends the process that starts it (code {process.returncode}{last and ', '}{last})"
     except subprocess.TimeoutExpired:
-        how = f"does not finish its start within {STARTS_WITHIN:g} s"
+        how = f"does not return from its start within {STARTS_WITHIN:g} s"
         process.kill()
         with suppress(subprocess.TimeoutExpired):  # one that hangs in its driver cannot even be killed
             process.communicate(timeout=1)

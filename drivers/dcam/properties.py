@@ -68,7 +68,7 @@ class Properties:
             if error.code not in _REFUSALS:
                 raise
             reply = codes.error_name(error.code)
-            raise self._refused(f"it does not accept {prop.name} = {value:g}", prop, value, reply) from error
+            raise self._refused(f"it refuses {prop.name} = {value:g}", prop, value, reply) from error
         return self.get(prop)
 
     def set_exactly(self, prop: Property, value: float) -> None:

@@ -74,7 +74,7 @@ class Session:
                 raise
             raise DeviceError(
                 self._device,
-                "DCAM found no camera",
+                "DCAM finds no camera",
                 request=error.request,
                 reply=codes.error_name(error.code),
                 expected="a camera that is switched on and has started up",

@@ -142,7 +142,7 @@ class SerialLine:
                 raise
             raise DeviceError(
                 device,
-                f"the port {url!r} cannot be opened: {problem}",
+                f"the port {url!r} does not open: {problem}",
                 expected="a port like /dev/ttyUSB0, COM3, socket://host:port or sim://pm16c",
                 advice=f"{of_port(url, problem)}. Serial ports of this computer: {serial_ports()}",
                 state="Nothing was sent",
@@ -196,15 +196,15 @@ class SerialLine:
                     self._reader.line(self._clock.now() + QUIET)
             if text is None:
                 what, received = (
-                    f"the complete reply did not arrive within {self._timeout:g} s",
+                    f"no whole reply within {self._timeout:g} s",
                     self._reader.incomplete[:80],
                 )
                 advice = _SILENT + (_SERVER if self._socket else "")
             elif isinstance(text, Damaged):
-                what, received = f"the reply was damaged in transmission: {text.why}", text.text
+                what, received = f"the reply was damaged on the way: {text.why}", text.text
                 advice = "Check the cable, its shield and the baud rate"
             else:
-                what, received = "the reply does not have the expected form", text
+                what, received = "the reply does not have the form it must have", text
                 advice = "There may be noise on the line, or the device may be another model"
             raise self._error(
                 DeviceTimeout if text is None else DeviceError,

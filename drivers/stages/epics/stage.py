@@ -200,9 +200,7 @@ class EpicsStage(LineStage):
         if not arrived and not fault:
             fault = self._hindrance()
         if not arrived or (aim and fault):
-            self._failed(
-                f"it stopped before it reached {aim}" if not arrived else f"a fault at {aim}", counts, fault, advice
-            )
+            self._failed(f"it stopped short of {aim}" if not arrived else f"a fault at {aim}", counts, fault, advice)
         self._searching = False
         return self.to_angle(counts)
 

@@ -98,7 +98,7 @@ class PiGcsStage(LineStage):
             self._searching = False
         elif target is not None and (self._away(status.counts) or not status.servo):
             wanted = f"{self._travel.degrees(target)}, {target} counts"
-            raise self._stopped_short(f"it stopped before it reached {self._travel.degrees(target)}", status, wanted)
+            raise self._stopped_short(f"it stopped short of {self._travel.degrees(target)}", status, wanted)
         elif target is not None and self._line.fault in MOTION:
             raise self._stopped_short(f"a fault at {self._travel.degrees(target)}", status, "no error of the move")
         return self.to_angle(status.counts)

@@ -142,7 +142,7 @@ class PM16CStage(LineStage):
         if target is not None and status.counts != target:
             raise DeviceError(
                 self.name,
-                f"it stopped before it reached {self._travel.degrees(target)} ({status.ending or 'no reason given'})",
+                f"it stopped short of {self._travel.degrees(target)} ({status.ending or 'no reason given'})",
                 request=self._channel.last_move,
                 reply=status.raw,
                 expected=f"{self._travel.degrees(target)}, {target} counts",

@@ -52,7 +52,9 @@ FAULTS = {
 }
 """Flags of a fault; the driver may be off."""
 ENDINGS = {
-    "WL": Meaning("a limit switch responded unexpectedly", "Check travel limits and cables, then search the reference"),
+    "WL": Meaning(
+        "a limit switch came where none was expected", "Check travel limits and cables, then search the reference"
+    ),
     "WV": Meaning("supply voltage out of range", "Check the power supply"),
     "WT": Meaning("controller hot", "Let it cool down"),
     "WS": Meaning("stalled and recovered", "Use a lower speed, acceleration or load"),
@@ -127,9 +129,7 @@ def damage(line: str, *, must_have_checksum: bool) -> str:
         return "it has no checksum" if must_have_checksum and line[0] == "@" else ""
     if not body.isascii() or checksum != lrc(body):
         return (
-            f"its checksum is {checksum!r} and not {lrc(body)!r}"
-            if body.isascii()
-            else "it has bytes that are not text"
+            f"its checksum is {checksum!r} and not {lrc(body)!r}" if body.isascii() else "it has bytes that are no text"
         )
     return ""
 

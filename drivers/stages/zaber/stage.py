@@ -117,7 +117,7 @@ class ZaberStage(LineStage):
             self._told = frozenset(status.flags)
             raise DeviceError(
                 self.name,
-                f"a fault at {aim}" if arrived else f"it stopped before it reached {aim}",
+                f"a fault at {aim}" if arrived else f"it stopped short of {aim}",
                 request=self._axis.last_move,
                 reply=status.raw,
                 expected=f"to be at {aim} without a fault",

@@ -58,7 +58,7 @@ FAULTS = {
     "truth": (("views: 12", "views: yes"), "my.yaml:3: scan.angles: views is true (YAML reads yes, no, on and off"),
     "a path of Windows in double quotes": (
         ("sample: {name: test}", 'sample: {name: test}\nstorage: {folder: "D:\\tomo\\new"}'),
-        "my.yaml:2: storage: folder is 'D:\\tomo\\new', with the control character '\\t': within double quotes a "
+        "my.yaml:2: storage: folder is 'D:\\tomo\\new', with the control character '\\t'. In double quotes a "
         "backslash begins one; write the text without quotes, or within single ones",
     ),
     "a line end in a port": (

@@ -120,7 +120,10 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
         refused = CliRunner().invoke(main, ["decide", "again"])
-        assert refused.exit_code == 2 and "does not ask what to measure next: it is acquiring" in refused.stderr
+        assert (
+            refused.exit_code == 2
+            and "is not waiting for a decision on what to measure next: it is acquiring" in refused.stderr
+        )
         assert list((run / "control").iterdir()) == [] and not chosen
         enter(State.ASKING)
         taken = CliRunner().invoke(main, ["decide", str(run), "again"])

@@ -299,7 +299,7 @@ def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
         ran = Ran(tmp_path, FakeInstrument(at={FIRST + VIEWS + 1: stop.abort}), *WORDS, *words, stop=stop)
     instrument.clock.sleep(1e4)
     with open_for_resume(ran.folder) as series:
-        assert series.in_words.endswith("has all 12 views, its missing offset views of the end are taken now")
+        assert series.in_words.endswith("has all 12 views; its missing offset views of the end are taken now")
         run_scan(series.config, series, instrument=instrument.connected())
     frames = frames_of(ran.folder / "joined.h5")
     assert [frame.trigger for frame in frames[FIRST:]] == list(range(VIEWS + WIDE))
@@ -311,7 +311,12 @@ def test_wide_views_that_are_missing_are_taken_also_where_no_references_follow(
     ("script", "cut", "missing", "words"),
     others_slow(
         [
-            ([Choice.ENOUGH], FIRST + 3, 0, "with 3 of 12 views; it had decided against the others."),  # in last flats
+            (
+                [Choice.ENOUGH],
+                FIRST + 3,
+                0,
+                "with 3 of 12 projections; the scan itself had decided to omit the others.",
+            ),  # in last flats
             ([Choice.AGAIN], FIRST + 9, 2, "with 10 of 12 views."),  # another pass of three was to be taken
             ([Choice.AGAIN], FIRST + 4, 7, "with 5 of 12 views."),  # the first pass lacks a view of its second time
         ],
@@ -334,7 +339,9 @@ def test_views_that_the_scan_decided_against_are_not_missing(
     instrument.at = {FIRST: stop.stop}
     resumed, chooser = open_for_resume(ran.folder), Scripted([])
     with choosing(monkeypatch, chooser), killed(monkeypatch), resumed as series, suppress(ScanStopped, DataError):
-        assert f"lacks {missing} of the" in series.in_words or "has all the views that it was to" in series.in_words
+        assert (
+            f"lacks {missing} of the" in series.in_words or "has all the projections that it was to" in series.in_words
+        )
         run_scan(series.config, series, stop=stop, instrument=instrument.connected())
     _, part, joined = recover_run(ran.folder)[0]
     assert (part.changed, part.missing, joined.missing) == (True, None, max(0, missing - 1))

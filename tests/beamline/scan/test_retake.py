@@ -74,7 +74,7 @@ def test_file_info_and_validate_count_them(tmp_path: Path) -> None:
     assert (facts["first_angle_deg"], facts["last_angle_deg"]) == (0, pytest.approx(168.75, abs=0.01))
     (found,) = [finding for finding in validate(path) if finding.rule == "flags"]
     assert found.severity == "info"
-    assert "Taken again: 3 views; the first (frames 8-9, 20) not used." in found.message
+    assert "Taken again: 3 projections; the first attempts (frames 8-9, 20) are not used." in found.message
     with h5py.File(path) as file:
         assert list(file["entry/frame_log/replaces"][FIRST + N :]) == [8, 9, 20, -1, -1]
         assert list(file["entry/frame_log/trigger"][FIRST + N : FIRST + N + 3]) == [16, 17, 18]
@@ -102,7 +102,7 @@ def test_one_attempt_is_made(tmp_path: Path) -> None:
     (found,) = [finding for finding in validate(ran.result.path) if finding.rule == "flags"]
     assert found.severity == "warning"
     said = "A reconstruction (--flags use): Of 16 views 1 has an alarm and is left out"
-    assert f"Frames with an alarm beside these: 22. {said}" in found.message
+    assert f"Other frames with an alarm: 22. {said}" in found.message
 
 
 def test_a_stop_ends_it_and_the_views_not_reached_stay_as_they_were(tmp_path: Path) -> None:

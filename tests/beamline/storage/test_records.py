@@ -61,7 +61,9 @@ def test_recover_says_it(path: Path, frames: list[Frame]) -> None:
     before = path.read_bytes()
     done = recover(path)
     assert (done.changed, done.altered) == (False, (ROW,))
-    assert f"with {len(frames)} frames; with another record than was written: frame {ROW};" in done.in_words()
+    assert (
+        f"with {len(frames)} frames; records differ from the checksum stored with them: frame {ROW};" in done.in_words()
+    )
     assert path.read_bytes() == before
 
 

@@ -44,7 +44,7 @@ def test_a_scan_that_draws_on_a_pipe(tmp_path: Path, path: Path, draw: Callable[
         draw(file, "pipe")
     open_scan(path).close()
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(DataError, match=r"links to .*or a pipe"):
+    with pytest.raises(DataError, match=r"has a link to .*or a pipe"):
         open_scan(path)
 
 

@@ -93,7 +93,7 @@ def test_arrays_tiffs_and_hdf5_are_read(tmp_path: Path) -> None:
         ("two.npz", None, r"holds 2 volumes \(a, b\)"),
         ("two.npz", "c", "has no array 'c'"),
         ("v.h5", "entry/data", "has no dataset 'entry/data'"),
-        ("v.npy", "volume", "holds one volume"),
+        ("v.npy", "volume", "contains one volume"),
         ("none.npy", None, "does not exist"),
     ):
         with pytest.raises(DataError, match=said):

@@ -111,7 +111,7 @@ def _with(**changes: Any) -> dict[str, Any]:
             "effect 'photon_noise' acts on photons and cannot follow 'offset', which acts on counts; "
             "the order is motion, optical depth, photons, electrons, counts",
         ),
-        (_with(effects=["offset", "offset"]), "effect 'offset' is named twice"),
+        (_with(effects=["offset", "offset"]), "effect 'offset' is given twice"),
         (
             _with(effects=["photon_noise", {"kind": "ring_current", "lifetime": 9}]),
             "effect 'ring_current' must come before 'photon_noise', which ends the photons",

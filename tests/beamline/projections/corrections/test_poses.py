@@ -219,7 +219,7 @@ def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp
         ("view,x\n0,1\n", "first line is 'view,x'"),
         ("view,shift_col_px\n", "header and no rows"),
         ("view,shift_col_px,colour\n0,1,2\n", "'colour' is unknown"),
-        ("view,shift_col_px,shift_col_px\n0,1,2\n", "there twice"),
+        ("view,shift_col_px,shift_col_px\n0,1,2\n", "occurs twice"),
         ("view,shift_col_px\n0,a\n", "'0,a' are not 2 numbers"),
         ("view,shift_col_px\n0\n", "'0' are not 2 numbers"),
         ("view,shift_col_px\n0,\n", "'0,' are not 2 numbers"),
@@ -246,7 +246,7 @@ def test_poses_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) 
         ("view,shift_col_px", (views, np.full(N, 321.0)), "view 0 is displaced by 321 columns and 0 rows"),
         ("view,shift_row_px", (views, np.full(N, 25.0)), "view 0 is displaced by 0 columns and 25 rows"),
         ("view,angle_deg,roll_deg", (views, DEGREES + 2, TURNS[:, 0]), r"frame 4 at 2 degrees, .* at 0; .*same scan"),
-        ("angle_deg,roll_deg", (DEGREES + 2.2, TURNS[:, 0]), "no pose of 40 of the 40 views"),
+        ("angle_deg,roll_deg", (DEGREES + 2.2, TURNS[:, 0]), "no pose for 40 of the 40 projections"),
     ):
         with pytest.raises(DataError, match=match):
             prepared(path, table(tmp_path, head, *columns))
@@ -284,7 +284,7 @@ def test_translations_of_an_nxtomo_file_need_their_directions(tmp_path: Path) ->
         read_poses(f"{motors}:y,x")
     with pytest.raises(DataError, match="cone's"):
         prepared(path, f"{motors}:x,-z", cone=(50.0, 60.0))
-    with pytest.raises(ValueError, match=r"^(?!.*damaged).*no sample/x_translation"):
+    with pytest.raises(ValueError, match=r"^(?!.*damaged).*none of sample/x_translation"):
         read_poses(f"{nexus(tmp_path)}:x,-z") if motors.unlink() is None else None
 
 
@@ -306,5 +306,5 @@ def test_a_cone_takes_poses_and_its_axis_is_found_in_them(tmp_path: Path) -> Non
 @pytest.mark.parametrize("mark", [" ", ","])
 def test_vectors_of_astra_without_names_get_the_way_to_name_them(tmp_path: Path, mark: str) -> None:
     np.savetxt(tmp_path / "s.geom", np.eye(12)[:3], delimiter=mark)
-    with pytest.raises(ValueError, match=r"12 numbers a line.*cone_vec=np.loadtxt\('s\.geom'\)"):
+    with pytest.raises(ValueError, match=r"12 numbers per line.*cone_vec=np.loadtxt\('s\.geom'\)"):
         read_poses(str(tmp_path / "s.geom"))

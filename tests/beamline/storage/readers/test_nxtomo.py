@@ -128,7 +128,7 @@ def test_the_ring_current_of_each_frame(tmp_path: Path) -> None:
         np.testing.assert_array_equal(over.table.currents, [np.nan] * 3 + [199.5, 200.0, 190.0, 180.0, np.nan])
 
 
-@pytest.mark.parametrize(("units", "said"), [(None, "no units attribute"), ("mm", "units 'mm'")])
+@pytest.mark.parametrize(("units", "said"), [(None, "no attribute units"), ("mm", "units 'mm'")])
 def test_angles_without_a_unit_are_refused_unless_the_caller_brings_angles(
     tmp_path: Path, units: str | None, said: str
 ) -> None:

@@ -85,12 +85,12 @@ def test_angles_of_a_known_format_may_lie_elsewhere(path: Path, images: np.ndarr
         ({"flats_path": "/motors/omega"}, r"expected frames .* found .*/motors/omega \(5,\)"),
         ({"angles_path": "/raw/before/one"}, r"has the shape \(4, 6\); expected a list of angles"),
         ({"angles_path": "/note"}, "expected a list of angles"),
-        ({"angles_path": "/motors/plain"}, "has no units attribute; .* --angles-unit deg or rad"),
-        ({"angles_path": "/motors/of_all", "angles_unit": "deg", "darks_path": None}, "has 10 angles, but there are 5"),
-        ({"angles": [0.0] * 5}, "--angles and --angles-path name the same thing twice"),
-        ({"flats": np.ones((1, 4, 6))}, "--flats and --flats-path name the same thing twice"),
+        ({"angles_path": "/motors/plain"}, "has no attribute units; .* --angles-unit deg or rad"),
+        ({"angles_path": "/motors/of_all", "angles_unit": "deg", "darks_path": None}, "has 10 angles, but 5"),
+        ({"angles": [0.0] * 5}, "--angles and --angles-path state the same thing"),
+        ({"flats": np.ones((1, 4, 6))}, "--flats and --flats-path state the same thing"),
         ({"data_path": None}, "--darks-path goes with --data-path: give both, or neither"),
-        ({"angles_path": None, "angles_unit": "rad"}, "--angles-unit goes with --angles-path: give both, or neither"),
+        ({"angles_path": None, "angles_unit": "rad"}, "--angles-unit requires --angles-path: give both, or neither"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(path: Path, said: dict[str, Any], message: str) -> None:

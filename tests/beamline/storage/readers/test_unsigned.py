@@ -72,7 +72,7 @@ def test_they_are_read_from_any_format_and_named(tmp_path: Path, kind: str) -> N
         np.testing.assert_array_equal(source.read(np.flatnonzero(source.table.kinds == 0)), counts)
         np.testing.assert_array_equal(source.read(np.flatnonzero(source.table.kinds == 1)), flats)
         np.testing.assert_array_equal([frame.counts for frame in source.frames()][-1], counts[-1])
-    assert any("int16 that wrapped, read as uint16" in finding.message for finding in validate(options))
+    assert any("int16 that overflowed, read as uint16" in finding.message for finding in validate(options))
 
 
 @pytest.mark.parametrize("flats_as", [np.uint16, np.int16])

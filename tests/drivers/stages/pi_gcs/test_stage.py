@@ -40,7 +40,7 @@ def test_errors_of_the_past_and_half_a_line_left_over_do_not_matter(rig: Rig) ->
         ({"axis": "2"}, r"no axis '2', but 1"),
         ({"trigger_line": 7}, r"error 36.*trigger_line"),
         ({"acceleration": 1e4}, r"error 17.*acceleration"),
-        ({"counts_per_turn": 100_000}, r"has 90000 counts a turn, which is no multiple of the configured 100000"),
+        ({"counts_per_turn": 100_000}, r"has 90000 counts per turn, which is not a multiple of the configured 100000"),
         ({"counts_per_turn": 0}, "counts_per_turn is 0"),
         ({"max_speed": 0.0}, "max_speed is 0.0"),
         ({"max_speed": 1e-9}, "must be 1e-06 deg/s"),

@@ -137,7 +137,7 @@ def test_an_image_of_another_shape_or_a_broken_one_is_named(series: tuple[Path, 
 
 def test_empty_and_broken_places_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataError, match="holds no image"):
+    with pytest.raises(DataError, match="contains no image"):
         open_scan(tmp_path / "empty")
     for name in ("broken.zip", "broken.tif"):
         (tmp_path / name).write_bytes(b"nothing of the kind")
