@@ -1,4 +1,6 @@
-"""Devices that move in the beam by others: a stage with named places, a shutter on an output, and manual devices."""
+"""Devices that move in the beam by means of another device: a stage with named positions, a shutter on a digital
+output; and devices moved by hand.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Devices for a RunEngine (ophyd-async): a whole scan that flies, and the rotation stage.
+"""Devices for a RunEngine (ophyd-async): a whole scan as one flyer, and the rotation stage.
 
 The scan is ours from trigger to file, in a thread: the RunEngine starts it, is told its rows as they are written, and
 waits for its end. So lost frames, a device that fails, and a missing beam are found by the scan, and fail `complete`.

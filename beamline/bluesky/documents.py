@@ -1,4 +1,5 @@
-"""Documents of bluesky (event-model) that describe a scan; its frames stay in our file, a stream datum names new rows.
+"""Bluesky documents (event-model) of a scan. Its frames stay in this program's file; a stream datum announces new
+rows.
 
 One index is one row of the file, darks and flats included. A trigger without a frame is no index.
 """

@@ -1,4 +1,4 @@
-"""Configuration of what stands in the beam: its monitor, shutters, the monochromator, and devices with named places."""
+"""Configuration of devices in the beam: beam monitor, shutters, monochromator, and devices with named positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Configuration of the devices: stage, camera, shutter, beam monitor and what moves in the beam, real or simulated."""
+"""Configuration of the devices: stage, camera, shutter, beam monitor and devices that move in the beam, real or
+simulated.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Configuration: a YAML file, BEAMLINE_* variables and --set overrides make one frozen Config, or a clear refusal."""
+"""Loads a configuration: combines a YAML file, BEAMLINE_* variables and --set overrides into one frozen Config, or
+reports what is wrong.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configuration models: every key a configuration file may hold, its unit, its legal values and its default."""
+"""Configuration models: every key of a configuration file, with its unit, allowed values and default."""
 
 from __future__ import annotations
 

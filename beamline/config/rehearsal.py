@@ -1,4 +1,4 @@
-"""Rehearsal: the configuration of a real instrument with the simulated counterpart of each of its devices."""
+"""Rehearsal: turns the configuration of a real instrument into one with simulated devices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Configuration of the rotation stage: one section per kind, with the keys that its settings declare.
+"""Configuration of the rotation stage: one section per kind of stage, with the keys that its settings declare.
 
 Adding a stage takes its folder `drivers/stages/<kind>`: a module `stage` with the driver, whose name DRIVERS of the
 folder says.

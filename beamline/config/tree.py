@@ -1,4 +1,5 @@
-"""Configuration text: YAML, --set and BEAMLINE_* variables as one tree, with the origin of each value, and its faults.
+"""Configuration text: merges YAML, --set and BEAMLINE_* variables into one tree, remembers where each value came
+from, and reports faults.
 
 Faults are pydantic's findings with file and line, the key, its value and the legal values.
 """

@@ -1,4 +1,4 @@
-"""Devices: the composition root, where a configuration becomes the devices of an instrument.
+"""Connects all devices of an instrument, as the configuration states them.
 
 Each is made by a module of its own; `simulated` makes them all where the instrument is simulated, and is the only one
 that names a simulator.
@@ -188,9 +188,9 @@ def connect(
     """Open every device that the configuration names. Nothing moves.
 
     Args:
-        clock: takes the place of the configured one.
-        ask: puts a request to the operator (manual shutter and sample mover); the terminal unless given.
-        check_stop: called again and again while there is something to wait for; an exception from it ends the wait.
+        clock: replaces the configured clock.
+        ask: function that asks the operator to move shutter or sample by hand; default: ask at the terminal.
+        check_stop: function that is called repeatedly during waits; an exception from it ends the wait.
 
     Raises:
         DeviceError: a device does not answer; those opened before it are closed again.

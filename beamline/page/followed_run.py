@@ -1,4 +1,4 @@
-"""The newest run of a folder for control systems: its values with the time and the alarm of what set each last."""
+"""The newest run of a folder, for control systems: its values, each with a time and an alarm state."""
 
 from __future__ import annotations
 

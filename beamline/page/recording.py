@@ -1,4 +1,4 @@
-"""Recording: the page's data from a scan file, also from a growing one. All calls come from one thread (HDF5)."""
+"""Recording: the page's data from a scan file, also a growing one. All calls must come from one thread (HDF5)."""
 
 from __future__ import annotations
 

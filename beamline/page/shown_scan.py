@@ -1,4 +1,6 @@
-"""ShownScan: a scan in any format on the page: its views over flats as a stack, means, and one slice for any axis."""
+"""ShownScan: a scan in any format on the page: its flat-field corrected projections as a stack, means, and one slice
+for any axis.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Tiles: parts of a picture, binned to the screen's resolution and packed as 16-bit numbers; answers that hold them."""
+"""Tiles: parts of a picture, binned to the screen's resolution and packed as 16-bit numbers, and the web answers
+with them.
+"""
 
 from __future__ import annotations
 

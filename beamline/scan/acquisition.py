@@ -1,4 +1,4 @@
-"""Acquisition: the blocks of a timeline become frames in file order, and the instrument is always left safe."""
+"""Acquisition: takes the frames of a timeline in file order, and always leaves the instrument in a safe state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Backlog: how many frames may wait for the disk, what pauses a scan before memory or disk is full, time left."""
+"""Backlog: how many frames may wait for the disk, when a scan pauses before memory or disk is full, and the time
+left.
+"""
 
 from __future__ import annotations
 

@@ -1,11 +1,12 @@
-"""Braking: assigns triggers to the frames that came after a stage was told to stop within a train.
+"""Braking: assigns triggers to the frames that were taken while the stage was braking after a stop within a pulse
+train.
 
 Noise on the trigger line exposes frames too, and times of triggers are no longer regular. The stage itself confirms the
 frames: from its speed u it stands u²/2a further on (constant deceleration a). So the place where it stands gives the
-begin of braking, and its place at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then
-the number of exposures must be the number of triggers up to that place, and the intervals between them must grow.
-Frames that neither confirms belong to no trigger. All functions are pure. A FlownTrain keeps the frames of a train that
-wait for their trigger.
+begin of braking, and its place at the time of each frame. A stage may brake otherwise, by jerk-limited ramps. Then the
+number of exposures must be the number of triggers up to that place, and the intervals between them must grow. Frames
+that neither confirms belong to no trigger. All functions are pure. A FlownTrain keeps the frames of a train that wait
+for their trigger.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Control: states of a scan in their allowed order, and verbs to a running one from another terminal.
+"""Control: the states of a scan and their allowed order, and commands to a running scan from another terminal.
 
 docs/states.md draws the states and explains the verbs in each. A verb is an empty file of that name in the folder
 `control` of the run, which only its owner can enter. The scan removes the file and obeys. This works on every system

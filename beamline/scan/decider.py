@@ -1,4 +1,4 @@
-"""Decider: after each pass of views it asks the law of the error, or the operator, what to measure next.
+"""Decider: after each pass of projections, decides from the error model, or asks the operator, what to measure next.
 
 It costs no frame, and the scan does not depend on it: without a law in time the plan goes on.
 """

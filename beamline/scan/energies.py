@@ -1,4 +1,4 @@
-"""Energies: a series of scans of one sample, one for each energy, in one folder; it can go on later.
+"""Energies: a series of scans of one sample, one per energy, in one folder; the series can be continued later.
 
 Each scan has a run folder of the usual kind in the series' folder, so that whatever reads a run reads it.
 """

@@ -1,4 +1,6 @@
-"""Exposures: a block of frames taken from camera and stage, flying, stepping or standing, each with its true angle."""
+"""Exposures: takes a block of frames with camera and stage (fly scan, step scan, or stage at rest), each with its
+true angle.
+"""
 
 from __future__ import annotations
 

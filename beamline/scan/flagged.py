@@ -1,4 +1,6 @@
-"""Flagged frames: which frames of a scan have flags, what these do to it, and which views are taken again."""
+"""Flagged frames: which frames of a scan have flags, what the flags do to the scan, and which projections are taken
+again.
+"""
 
 from __future__ import annotations
 

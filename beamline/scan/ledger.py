@@ -1,13 +1,13 @@
-"""Ledger: which trigger exposed which frame, derived from framestamps and times, so that no angle is guessed.
+"""Ledger: assigns frames to triggers from framestamps and times, so that no angle is guessed.
 
 A camera counts the frames it exposes. A gap in its framestamps is a frame that was exposed and lost in transfer. The
 camera ignores a trigger that comes too early: framestamps stay contiguous and only the time shows a gap of two periods.
 While a stage turns at constant speed, trigger times are linear in the trigger's index. So the index of a frame is the
 nearest whole number of periods since the frame before. Slow drift is followed by an alpha-beta filter (Benedict &
-Bordner 1962). Noise on the trigger line exposes frames, too. If the first trigger's time is not known well, the
-first frames are those that form a regular train. Of two frames that could belong to a trigger, the nearer one does.
-This needs the following frames: see `enter`. Frames exposed while the stage brakes come with the times at
-which their triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
+Bordner 1962). Noise on the trigger line exposes frames, too. If the first trigger's time is not known well, the first
+frames are those that form a regular train. Of two frames that could belong to a trigger, the nearer one does. This
+needs the following frames: see `enter`. Frames exposed while the stage brakes come with the times at which their
+triggers would have come at constant speed (see braking.py). All functions are pure; a Ledger is a value.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Plan of the live volume of a scan: its binning, its views and its memory."""
+"""Plan of the live volume of a scan: binning, number of projections, and memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Live reconstruction: a separate process that follows the growing file, so that its failure cannot harm the scan."""
+"""Live reconstruction: starts a separate process that follows the growing file, so that its failure cannot harm the
+scan.
+"""
 
 from __future__ import annotations
 
@@ -307,7 +309,7 @@ class Standby:
 
 
 def reconstruct(command: Sequence[str], log: Path, sink: Sink, stop: StopRequest) -> Mapping[str, Any] | None:
-    """The data of the `done` event of a reconstruction of a complete scan, as `LiveReconstruction.finish`."""
+    """The data of the `done` event of a reconstruction of a complete scan, as in `LiveReconstruction.finish`."""
     process = LiveReconstruction(command, log, sink, what="reconstruction", silence=math.inf, low_priority=False)
     try:
         return process.finish(lambda: stop.stopping, lambda: stop.aborting)

@@ -1,4 +1,4 @@
-"""Measurement: acquisition, decider, recorder and live reconstruction of one scan, until its file is closed."""
+"""Measurement: runs acquisition, decider, recorder and live reconstruction of one scan until its file is closed."""
 
 from __future__ import annotations
 

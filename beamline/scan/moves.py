@@ -1,4 +1,6 @@
-"""Moves: stage, shutter and sample come to where a block needs them, are looked at again, and are left safe."""
+"""Moves: brings stage, shutter and sample to the positions that a block needs, checks them afterwards, and leaves
+them safe.
+"""
 
 from __future__ import annotations
 

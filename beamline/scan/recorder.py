@@ -1,4 +1,5 @@
-"""Recorder: digests, checks and writes every frame beside the scan, so that taking frames never waits for the disk.
+"""Recorder: computes statistics of every frame, checks it and writes it, in threads of its own, so that acquisition
+never waits for the disk.
 
 Two threads, in the order of the frames: one digests a frame and lets the monitor look at it, while the other writes the
 frame before. Both spend nearly all their time in code that lets the other run. The monitor sees each frame as a reader

@@ -1,4 +1,4 @@
-"""References of a running scan: darks and flats are noted as they are recorded, and judged before the projections."""
+"""Darks and flats of a running scan: collects them as they are recorded, and checks them before the projections."""
 
 from __future__ import annotations
 

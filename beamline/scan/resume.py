@@ -1,4 +1,4 @@
-"""Resume: a run that was killed, failed, stopped or aborted goes on; missing frames go into a new file.
+"""Resume: continues a run that was killed, failed, stopped or aborted; the missing frames go into a new file.
 
 Existing files are only read (after `recover`, if their writer died), so that stored frames are never at risk. The
 new part has a folder like that of a run, `part-2`, `part-3` ... in the run's, and `joined.h5` beside the first

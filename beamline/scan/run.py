@@ -1,4 +1,4 @@
-"""Run: one scan from configuration to file, in its own folder, reported by events, and closed in any case."""
+"""Run: one scan from configuration to file, in a folder of its own, reported by events, and closed in any case."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Supervision: what an acquisition asks of the scan around it, and the beam monitor, whose log may pause it."""
+"""Supervision: hooks of an acquisition into the scan around it, and the beam monitor, whose readings may pause the
+scan.
+"""
 
 from __future__ import annotations
 

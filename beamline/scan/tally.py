@@ -1,4 +1,4 @@
-"""Tally: what came of each block of a scan, in numbers and in sentences."""
+"""Tally: counts the frames of each block of a scan, and describes missing and extra ones in sentences."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""Watchdog: a process that makes the instrument safe when the process of the scan dies or freezes without doing so.
+"""Watchdog: a process that stops the stage and closes the shutter if the process of the scan is killed or freezes.
 
 `python -m beamline.scan.watchdog RUN PID` reads its stdin, which the scan holds open as long as it lives, and to which
 it writes a byte each BEAT: at the end (kill -9), or after FROZEN s without one (SIGSTOP, a hung disk), it acts. A line
-says that it is ready. One that has ended is replaced. A frozen scan holds the
-stage's port, so it is killed first. What the scan held is free then: the port, which the watchdog opens, and the
-camera, which stops without its program. A scan that ends by itself kills the watchdog first. As long as its scan lives,
-the watchdog ignores the requests to end that a shutdown sends to every process.
+says that it is ready. One that has ended is replaced. A frozen scan holds the stage's port, so it is killed first. What
+the scan held is free then: the port, which the watchdog opens, and the camera, which stops without its program. A scan
+that ends by itself kills the watchdog first. As long as its scan lives, the watchdog ignores the requests to end that a
+shutdown sends to every process.
 """
 
 from __future__ import annotations

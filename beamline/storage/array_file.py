@@ -1,4 +1,4 @@
-"""Arrays that a Zarr, an .npy or an .npz has by their names, as an HDF5 file has datasets."""
+"""Arrays of a Zarr, an .npz or an .npy, opened by name like the datasets of an HDF5 file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Text, units, links and frames, in any order, of an open HDF5 file."""
+"""Datasets of an open HDF5 file: text, numbers with units, links, and frames in any order."""
 
 from __future__ import annotations
 

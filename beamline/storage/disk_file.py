@@ -1,4 +1,4 @@
-"""Files on a disk: under HDF5 for its driver `fileobj`, scratch arrays without a name, and fsync in a thread."""
+"""Files on a disk: Python file objects that HDF5 writes to, unnamed scratch arrays, and fsync in a thread."""
 
 from __future__ import annotations
 

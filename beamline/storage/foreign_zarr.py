@@ -1,4 +1,4 @@
-"""Volumes in a Zarr, versions 2 and 3 with any codec, by the format's library where it is installed.
+"""Volumes in a Zarr of another program, versions 2 and 3 with any codec, read with the zarr library.
 
 Axes, scales and units are those of ngff.openmicroscopy.org, 0.4 and 0.5; translations are left out.
 """

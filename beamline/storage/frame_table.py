@@ -1,4 +1,6 @@
-"""FrameTable: what each frame of a scan is, a column for each fact and a row for each frame."""
+"""FrameTable: a table of all frames of a scan, with a row for each frame and a column for each fact (kind, angle,
+time, ...).
+"""
 
 from __future__ import annotations
 

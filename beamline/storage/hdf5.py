@@ -1,4 +1,4 @@
-"""Opening and writing HDF5 files that may be growing, locked or damaged, and why one cannot be read."""
+"""Opens and writes HDF5 files, also growing, locked or damaged ones, and explains why a file cannot be read."""
 
 from __future__ import annotations
 

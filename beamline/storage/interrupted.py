@@ -1,4 +1,5 @@
-"""Interrupted runs: the scan and the volume of a run, and the next step for one that ended early.
+"""Interrupted runs: finds the scan file and the volume of a run, and tells the user the next step if the run ended
+early.
 
 Every command that meets such a run says the same, by `next_step`.
 """

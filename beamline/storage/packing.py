@@ -1,4 +1,6 @@
-"""Packed numbers: datasets whose attributes say what values the stored numbers stand for, as of CF (netCDF) and CIL."""
+"""Packed numbers: datasets whose attributes (scale, offset) say how stored numbers are converted to values, as in CF
+(netCDF) and CIL files.
+"""
 
 from __future__ import annotations
 

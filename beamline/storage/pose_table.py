@@ -1,4 +1,6 @@
-"""PoseTable: displacement, roll and tilt of each view, or its vectors, from a CSV, .npz, a volume or an NXtomo file."""
+"""PoseTable: displacement, roll and tilt of each projection, or its vectors, read from a CSV, an .npz, a volume or
+an NXtomo file.
+"""
 
 from __future__ import annotations
 

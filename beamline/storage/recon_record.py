@@ -1,4 +1,4 @@
-"""ReconRecord: the record of a volume, the same in its file, in the event `done` and in scripts."""
+"""ReconRecord: the facts about a volume, identical in its file, in the event `done` and in scripts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames as a scan file of this program records them: their table, and rows that no longer match their checksum."""
+"""Frames in a scan file of this program: their table, and rows that no longer match their checksum."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""recover: an ordinary scan file in place of one whose writer died, with every committed frame.
+"""recover: replaces the file of a scan whose process was killed by an ordinary file with all complete frames.
 
 The frames are copied to a new file, which takes the place of the old one once it is on the disk. Whatever stops the
 copy leaves the old file as it was.

@@ -1,4 +1,4 @@
-"""Structure: the objects of an HDF5 file and the other files that it draws on, looked at before any of them is opened.
+"""Structure of an HDF5 file: checks its objects and the other files that it refers to, before any of them is opened.
 
 HDF5 opens whatever a link names: it waits for ever for a pipe, and for names of deeply nested groups.
 

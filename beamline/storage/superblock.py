@@ -1,4 +1,5 @@
-"""HDF5's own blocks: the first 48 bytes of a file, and blocks that a kill left half written.
+"""Low-level blocks of HDF5: the first 48 bytes of a file, and blocks that are half written because the process was
+killed.
 
 The head says whether the file is being written and how many bytes it has. A kill may end a write where two pages of the
 file system's memory meet. The block is then new up to there, and old after it. Each field is the new or the old one,

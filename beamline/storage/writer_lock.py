@@ -1,4 +1,4 @@
-"""Locks on files: ours on a file that is being written, and failures of HDF5's own.
+"""Locks on files: those of this program on a file that is being written, and failures of HDF5's own locks.
 
 Ours keeps a long silence from counting as the death of a writer. The system gives it back when the program ends,
 however it ends. HDF5 has none while a file can be followed, but locks every file that it creates or opens to read

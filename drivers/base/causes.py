@@ -1,6 +1,8 @@
-"""Causes: why a library does not load, a port does not open, and who else speaks on a line.
+"""Causes of failures: why a library does not load, why a port does not open, and which other service answers on a
+line.
 
-The one place where drivers turn what others say (loaders, operating systems, servers) into a sentence and the way on.
+The one place where drivers turn what others say (loaders, operating systems, servers) into a sentence and the way
+on.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""DeviceError: the request, the reply, what was expected, what to do, and in which state the device was left."""
+"""DeviceError: an error of a device with request, reply, what was expected, what to do, and the state of the device."""
 
 from __future__ import annotations
 

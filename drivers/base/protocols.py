@@ -1,4 +1,6 @@
-"""Device Protocols: the interfaces of stage, camera, shutter and all that moves in the beam, in rad, s and keV."""
+"""Device Protocols: interfaces of stage, camera, shutter and devices that move in the beam; units are rad, s and
+keV.
+"""
 
 from __future__ import annotations
 

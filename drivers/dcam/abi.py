@@ -1,4 +1,4 @@
-"""The DCAM-API v4 through ctypes: the library, with one Python method for each function that this driver calls."""
+"""DCAM-API v4 through ctypes: loads the library, with one Python method for each function that this driver calls."""
 
 from __future__ import annotations
 

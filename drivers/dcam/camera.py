@@ -1,4 +1,6 @@
-"""DcamCamera: a Hamamatsu camera over the DCAM-API, with a ring of buffers, one copy a frame and a check for losses."""
+"""DcamCamera: a Hamamatsu camera over the DCAM-API, with a ring buffer, one copy per frame, and detection of lost
+frames.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Properties of one DCAM camera: set, read back and compare; the wait until its sensor is cold."""
+"""Properties of one DCAM camera: sets them, reads them back and compares; waits until the sensor is cold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Ring: the library's ring of frame buffers during one capture; frames are taken in order, with one copy each."""
+"""Ring buffer: the frame buffers of the DCAM library during one capture; frames are read in order, with one copy
+each.
+"""
 
 from __future__ import annotations
 

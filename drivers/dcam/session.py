@@ -1,4 +1,4 @@
-"""Session: looks for the camera on USB, starts the library, opens one camera and its wait handle, and closes them."""
+"""Session: finds the camera on USB, starts the library, opens one camera and its wait handle, and closes them."""
 
 from __future__ import annotations
 

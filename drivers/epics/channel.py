@@ -1,4 +1,4 @@
-"""Process variables, or records by their fields, over PVAccess (p4p) or Channel Access (aioca)."""
+"""EPICS process variables, and records with their fields, over PVAccess (p4p) or Channel Access (aioca)."""
 
 from __future__ import annotations
 

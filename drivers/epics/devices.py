@@ -1,4 +1,4 @@
-"""Shutter, filter, monochromator and beam monitor behind process variables."""
+"""Shutter, filter, monochromator and beam monitor that are controlled by EPICS process variables."""
 
 from __future__ import annotations
 

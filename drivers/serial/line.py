@@ -1,4 +1,4 @@
-"""SerialLine: requests and replies over any pyserial URL: a serial port, socket://, or a simulator's sim://.
+"""SerialLine: requests and replies over any pyserial URL: a serial port, socket://, or sim:// of a simulator.
 
 Three rules keep requests and replies in step: one request at a time, a finite timeout, and every reply must match the
 form expected. After a timeout or a reply of another form, received data are discarded until the device has answered a

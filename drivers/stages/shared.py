@@ -1,4 +1,4 @@
-"""Shared code of the stages: positions by their travel, stops, the wait until they stand, and settings to restore.
+"""Code that all stages share: positions, stops, waiting for the end of a move, and restoring settings.
 
 Settings that a driver changes in a controller are kept in a file, as they were found, until they are restored: a
 program that is killed leaves its speed in the controller, and the next one would take it for the original.

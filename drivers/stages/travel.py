@@ -1,4 +1,4 @@
-"""Travel of a stage: radians and whole counts, soft limits, and the refusal of impossible moves and trains."""
+"""Travel of a stage: converts radians to whole counts, and raises errors for moves and trains beyond the limits."""
 
 from __future__ import annotations
 

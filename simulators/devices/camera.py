@@ -1,4 +1,4 @@
-"""Simulated ORCA-Quest: exposes the scene at the true angle of each trigger, by the real camera's rules for time.
+"""Simulated ORCA-Quest: exposes the scene at the true angle of each trigger, with the timing of the real camera.
 
 Nothing runs in the background: the camera catches up with the trigger line and the clock whenever it is asked, and a
 frame is computed when it is taken. Triggers and frames are numbered over the camera's life for faults and noise, so

@@ -1,4 +1,4 @@
-"""Catalogue: every effect by name, with its domain and its place in it; no effect's module is imported here.
+"""Catalogue: every effect by name, with its domain and its place in the order; no effect's module is imported here.
 
 The module of effect `photon_noise` is simulators.effects.sensor, and its class PhotonNoise. It is imported when a
 scene names the effect. EFFECTS of a folder has those in it.

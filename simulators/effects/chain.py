@@ -1,4 +1,4 @@
-"""Chain: a scene's effects in order, from the moving sample to the counts; the order is checked once."""
+"""Chain: the effects of a scene in order, from the moving sample to the counts; the order is checked once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensor: efficiency, noise, dark current, full well, offset and converter."""
+"""Effects of the sensor: efficiency, noise, dark current, full well, offset and analogue-to-digital converter."""
 
 from __future__ import annotations
 

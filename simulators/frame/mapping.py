@@ -1,4 +1,4 @@
-"""Mapping: reads a scene's YAML mapping into frozen dataclasses; an error names the path of its key."""
+"""Reads a scene's YAML mapping into frozen dataclasses; an error names the path of the wrong key."""
 
 from __future__ import annotations
 

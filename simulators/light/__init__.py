@@ -1,4 +1,4 @@
-"""Light: beams, their energies, and materials whose attenuation depends on them."""
+"""Light: beams and their energies, and materials whose attenuation depends on the energy."""
 
 from __future__ import annotations
 

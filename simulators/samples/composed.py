@@ -1,4 +1,4 @@
-"""Phantoms: the sample that a scene's mapping names; a kind's module is imported only when it is named."""
+"""Phantoms: builds the sample that a scene's mapping names; a kind's module is imported only if it is named."""
 
 from __future__ import annotations
 

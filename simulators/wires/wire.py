@@ -1,6 +1,7 @@
-"""Wire: the far end of a serial cable: bytes in, bytes out; and `sim://name`, which opens it.
+"""Wire: the other end of a serial cable, bytes in and bytes out; and `sim://name`, which opens it.
 
-pyserial opens such a URL by the same code path as a real port. It finds the scheme in `simulators.wires.protocol_sim`
+pyserial opens such a URL by the same code path as a real port. It finds the scheme in
+`simulators.wires.protocol_sim`
 once this module is imported. Names are process-wide, as the ports of a computer are.
 """
 

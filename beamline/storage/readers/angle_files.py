@@ -1,4 +1,4 @@
-"""Angles from outside the scan file: read, and given to frames only where their number fits."""
+"""Angles from a separate file: reads them, and assigns them to the frames if their number matches."""
 
 from __future__ import annotations
 

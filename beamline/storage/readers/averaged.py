@@ -1,4 +1,4 @@
-"""Scans whose views are means of several frames."""
+"""Scans whose projections are the means of several frames."""
 
 from __future__ import annotations
 

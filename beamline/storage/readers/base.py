@@ -1,4 +1,6 @@
-"""ScanSource: a scan of any file format; a format adds a subclass, and a ScanFormat for the registry."""
+"""ScanSource: the interface of a scan file of any format. A format adds a subclass, and a ScanFormat for the
+registry.
+"""
 
 from __future__ import annotations
 

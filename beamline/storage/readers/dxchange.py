@@ -1,4 +1,4 @@
-"""Scans as Data Exchange: the /exchange group (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224)."""
+"""Scan files in the Data Exchange format: the /exchange group (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224)."""
 
 from __future__ import annotations
 

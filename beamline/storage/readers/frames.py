@@ -1,4 +1,4 @@
-"""Frames: a scan made of the frames of others, such as its parts, or what comes before them; with changed pixels."""
+"""Frames: a scan composed of the frames of other scan files, such as its parts, also with changed pixels."""
 
 from __future__ import annotations
 

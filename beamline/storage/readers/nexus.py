@@ -1,5 +1,6 @@
-"""What NeXus files state, and where: the detector with frames and image keys, angles, pixels, energy, a cone beam, and
-mirrored frames."""
+"""Facts in NeXus files and where they are stored: the detector with frames and image keys, angles, pixel size,
+energy, a cone beam, and mirrored frames.
+"""
 
 from __future__ import annotations
 

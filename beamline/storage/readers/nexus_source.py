@@ -1,4 +1,5 @@
-"""NexusSource: a scan with the structure of NXtomo, as ESRF and Diamond write it, and as `nxtomo` reads ours.
+"""NexusSource: a scan with the structure of NXtomo, as ESRF and Diamond write it; base of the reader of this
+program's own files (`nxtomo`).
 
 What counts is the structure, an NXdetector with `data` [frame, row, col] and `image_key`, wherever the entry is.
 """

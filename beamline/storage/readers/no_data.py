@@ -1,4 +1,6 @@
-"""Detectors of several modules: pixels in the gaps hold a mark instead of counts, and photon counters have no dark."""
+"""Detectors of several modules: pixels in the gaps have a marker value instead of counts, and photon counters have
+no darks.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scans as NXtomo lays them out: ours, also while they grow, and those of other programs (`nexus_source`)."""
+"""NXtomo scan files: those of this program, also while they grow, and those of other programs (`nexus_source`)."""
 
 from __future__ import annotations
 

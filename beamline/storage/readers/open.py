@@ -1,4 +1,4 @@
-"""open_scan: a scan in any format of the registry, recognised by what is in it."""
+"""open_scan: opens a scan in any format of the registry; the format is recognised from the content."""
 
 from __future__ import annotations
 

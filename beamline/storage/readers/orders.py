@@ -1,4 +1,6 @@
-"""Orders of dimensions: which of an array's are frames, rows and columns, by what is stated and by shapes."""
+"""Order of dimensions: which dimensions of an array are frames, rows and columns, from what the file or the user
+states and from the shapes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Darks and flats from outside the scan file: an array, images, or a file of their own, as httomo and Savu have."""
+"""Darks and flats from outside the scan file: an array, images, or a separate file, as in httomo and Savu."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that makers of CT scanners write beside their images: distances, pixel size, angles and white level.
+"""Settings files that CT scanners write next to their images: distances, pixel size, angles and white level.
 
 Nikon's .xtekct, SkyScan's .log, GE phoenix's .pca, ScanParameter.xml of YXLON, the .xml of Diondo and
 the "data settings XRE.txt" of TESCAN (FleXray), by keys that

@@ -1,4 +1,5 @@
-"""StacksSource: a scan with a stack of projections and others of darks and flats, such as HDF5 under any names.
+"""StacksSource: a scan with one stack of projections and others of darks and flats, such as HDF5 datasets of any
+name.
 
 Such a layout does not say when the references were taken: the frames are numbered darks first, then flats, then
 projections.

@@ -1,4 +1,4 @@
-"""TIFF images: reading them whole, and what all readers of them ask. Images as .npy and PNG are read whole, too."""
+"""Single images: reads a TIFF, .npy or PNG as a whole; helper functions for all readers of images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Scans that are read otherwise than they are stored: some columns, other kinds or types, or the frames of several."""
+"""Scans that are read differently from how they are stored: some columns only, other kinds or pixel types, or the
+frames of several files.
+"""
 
 from __future__ import annotations
 

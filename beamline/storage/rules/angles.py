@@ -1,4 +1,4 @@
-"""Stated angles: every view has one, they are degrees, and together they go round half a turn."""
+"""Rules on stated angles: every projection has one, they are in degrees, and together they cover 180 degrees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Angles that views show: views that see the same rays by the stated angles look the same, and no others do."""
+"""Rules that compare angles with images: projections of the same rays, by their stated angles, look the same, and no
+others do.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Evidence of a scan: what its references and some views show, computed once a job from frames read once, handed on."""
+"""Evidence of a scan: facts from its darks, flats and some projections, computed once per job from frames read once,
+and passed on.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""FlagPolicy: how a reconstruction uses views by their flags, in the words of every command; and flags as a finding."""
+"""FlagPolicy: which projections a reconstruction drops or gives less weight because of monitor flags, and the
+messages about it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Light: good references, of one light with the views, each of one scale; what else explains their counts."""
+"""Rules on intensity: flats and darks must be usable and match the projections; otherwise, what else may explain
+their counts.
+"""
 
 from __future__ import annotations
 

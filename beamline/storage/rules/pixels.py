@@ -1,4 +1,6 @@
-"""Rules on what the values of pixels are: counts, transmission or line integrals, as the scan says, and measured."""
+"""Rules on pixel values: whether they are counts, transmission or line integrals as stated, and whether they were
+measured.
+"""
 
 from __future__ import annotations
 

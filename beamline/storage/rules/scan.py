@@ -1,4 +1,6 @@
-"""Conditions for trust in a scan of any format, one function a rule. Public validators accept NaN angles, not these."""
+"""Rules for a scan of any format, one function per rule. Validators of other programs accept NaN angles; these rules
+do not.
+"""
 
 from __future__ import annotations
 

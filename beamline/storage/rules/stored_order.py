@@ -1,4 +1,4 @@
-"""Rules on the order in which frames are stored: dimensions of a stack, direction of the axis."""
+"""Rules on the order in which frames are stored: dimensions of a stack, direction of the rotation axis."""
 
 from __future__ import annotations
 

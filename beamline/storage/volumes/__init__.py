@@ -1,4 +1,4 @@
-"""Files that hold a volume, by format."""
+"""Volume files, by format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The interface of a format of volume files, the conversion of voxels to grey values, and the facts beside them."""
+"""Interface of a volume file format, conversion of voxels to grey values, and the facts stored with them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The formats of volume files, by the suffix of a name; writing one as a whole, and opening one slice by slice."""
+"""Formats of volume files, chosen by the suffix of the name: writes a volume as a whole, and opens one slice by
+slice.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The layout of our HDF5 scans: every path, type and unit, made once before the first frame and only grown after.
+"""Layout of this program's HDF5 scan files: every path, type and unit. All datasets are created before the first
+frame and only grow afterwards.
 
     /entry                      NXentry, definition NXtomo (NeXus definitions 2026.01): title, start_time, end_time
       instrument/detector       data u16 [frame, row, col] (one frame a chunk), image_key, image_key_control,
@@ -8,7 +9,8 @@
       instrument/monochromator  NXmonochromator: energy (keV), where there is a monochromator
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
-      frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; checksum: of these,
+      frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; checksum: of
+      these,
                                 of its angle, image key and count_time (record_checksums); its flags,
                                 flag_scores, flag_regions and frame_valid; flag_legend: bits of the flags
       digest                    statistics of each frame, and preview f32 [frame, row, col]

@@ -1,4 +1,4 @@
-"""NXtomoWriter: a scan's file while it grows, in a state that a reader can trust after every frame.
+"""NXtomoWriter: writes the file of a scan so that a reader can trust it after every frame.
 
 The file is written SWMR (single writer, multiple readers). Others can read flushed frames at once, and these survive
 the death of this process. Every second they are brought to the disk (fsync), where they survive a loss of power.

@@ -1,4 +1,4 @@
-"""Partial volumes: the slabs of a volume that are finished, in a file that stays readable however its writer ends.
+"""Partial volumes: the finished slabs of a volume, in a file that stays readable even if the process is killed.
 
 An NXtomoproc file whose places are all allocated when it is made, and written through memory maps, so that nothing of
 its structure changes later. Slices that two slabs share are kept beside while one of them is added. A slab that was

@@ -1,4 +1,4 @@
-"""Reconstruction files: a volume with all settings and its history, as NXtomoproc; written whole or not at all.
+"""Reconstruction files: a volume with all settings and its history, as NXtomoproc; written completely or not at all.
 
 Checkpoints hold a fit's state and what it was made from; each whole, in place of the one before.
 """

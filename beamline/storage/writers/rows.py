@@ -1,4 +1,4 @@
-"""Rows of a scan file, one a frame, and the end of the file.
+"""Rows of a scan file, one per frame, and the final entries of the file.
 
 It tells how the scan ended, which triggers gave no frame and why, and has the frames as /exchange, the layout of De
 Carlo et al. (2014), "Scientific data exchange: a schema for HDF5-based storage of raw and analyzed data",

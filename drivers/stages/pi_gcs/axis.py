@@ -1,4 +1,5 @@
-"""One axis of a PI GCS 2.0 controller and its trigger line: its commands and queries. Counts here, degrees on the wire.
+"""One axis of a PI GCS 2.0 controller and its trigger line: commands and queries, converted between counts (here)
+and degrees (controller).
 
 Set commands are followed by ERR?, and important values are read back. Protocol: the C-863's manual (MS249E),
 cross-checked with EPICS' and the vendor's host software. One axis, one parameter a line; no daisy chain.

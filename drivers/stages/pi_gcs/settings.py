@@ -1,4 +1,4 @@
-"""Settings of a PI GCS 2.0 stage, which the controller takes as they are, in degrees, and its trigger trains.
+"""Settings of a PI GCS 2.0 stage, in degrees as the controller uses them, and its trigger pulse trains.
 
 Trains are those of mode 0 (PositionDistance). The controller gives a pulse at each step between the thresholds, if the
 stage entered through the start threshold. The stop threshold lies half an interval behind the last pulse, so that it

@@ -1,4 +1,5 @@
-"""One axis of a Zaber device in the device's own units: microsteps, native speeds, settings, flags, and its replies.
+"""One axis of a Zaber device in the device's own units (microsteps, native speeds), with its settings, flags and
+replies.
 
 Every command except a stop has its own message id and waits for its reply, which accepts or rejects it. Commands and
 replies are Zaber's ASCII protocol version 2, as the vendor's library zaber-motion sends and accepts it. Meanings of

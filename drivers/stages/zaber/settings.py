@@ -1,4 +1,4 @@
-"""Settings of a Zaber stage, their values in the controller, and a pulse train as its triggers.
+"""Settings of a Zaber stage, their values in the controller, and a pulse train programmed as triggers.
 
 One trigger fires once, at the right place, and enables a second that counts distance. The starter fires one step before
 the first pulse, the repeater then each step. So the stage may stand anywhere before the train. The time that firmware

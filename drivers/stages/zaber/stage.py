@@ -1,4 +1,5 @@
-"""Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output by distance.
+"""Zaber rotary stage with triggers (ASCII protocol, firmware 7.06 or later): pulses on a digital output at equal
+distances.
 
 Positions are commanded microsteps unless `measured`. Facts about the firmware that are from memory are settings:
 those of `ZaberSettings`.

@@ -1,4 +1,4 @@
-"""What a beam does that is not steady, even, wide enough and of one energy."""
+"""Effects of the beam: not constant, not uniform, too narrow, or of several energies."""
 
 from functools import partial
 

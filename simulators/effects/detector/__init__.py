@@ -1,4 +1,4 @@
-"""Faults of scintillator, optics and sensor."""
+"""Effects of scintillator, optics and sensor."""
 
 from functools import partial
 

@@ -1,4 +1,6 @@
-"""Pixels of the sensor: their response, hot and dead ones, zingers, and rows that are exposed one after the other."""
+"""Effects of the sensor's pixels: sensitivity, hot and dead pixels, zingers, and rows that are exposed one after the
+other.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What light does beside being absorbed by the sample: it is refracted and scattered, and meets crumbs on its way."""
+"""Effects of refraction and scattering in the sample, and of loose particles in the beam."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""Light that the sample deflects, and crumbs that it meets on its way."""
+"""Light that the sample deflects, and loose particles in its path."""
 
 from __future__ import annotations
 

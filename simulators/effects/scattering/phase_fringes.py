@@ -1,4 +1,4 @@
-"""Phase fringes: the wave interferes with itself between sample and detector, and edges get bright rims."""
+"""Phase fringes: the wave interferes with itself between sample and detector, which gives edges bright rims."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of the stage: of its encoder, backlash, wobble and runout of its axis; and a sample that slips on it."""
+"""Errors of the stage: its encoder, backlash, wobble and runout of its axis; and a sample that slips on it."""
 
 from __future__ import annotations
 

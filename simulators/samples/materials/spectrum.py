@@ -1,4 +1,4 @@
-"""Spectrum: a beam's energies and weights, as few as its sample needs."""
+"""Spectrum: energies and weights of a beam, reduced to as few as its sample needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Voxels: a sample given by a volume of attenuation, from a file or a reconstruction, with labels.
+"""Voxels: a sample defined by a volume of attenuation, from a file or a reconstruction, with labels.
 
 The sample is the linear interpolation between the voxels' centres, for projections and truth alike. In a scene:
 

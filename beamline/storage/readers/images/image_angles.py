@@ -1,4 +1,4 @@
-"""Angles in the names of image files, and why they may be none."""
+"""Angles in the names of image files, and why a number in a name may not be an angle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Names of image files: the kind of each frame, and its place by numbers and angles."""
+"""Names of image files: the kind of each frame, and its place in the scan from numbers and angles."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""TIFF series: a folder (or .zip) with one image a file, as TIFF, or else as .npy or PNG; a scene of R²-Gaussian.
+"""Image series: a folder (or .zip) with one image per file, as TIFF, .npy or PNG; or a scene of R²-Gaussian.
 
-The name of a file tells its kind, see `image_names`; all but darks and flats must be one series. They are put in the
-order of the numbers in their names, never of a listing. Files are read one at a time, so that memory does not grow with
-the scan. Hidden files (`._0001.tif` of a Mac) are not looked at.
+The name of a file tells its kind, see `image_names`; all files except darks and flats must be one series. They are
+sorted by the numbers in their names, never by a directory listing. Files are read one at a time, so that the memory
+needed does not grow with the scan. Hidden files (`._0001.tif` of a Mac) are ignored.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""TIFF stacks: one file with a page for each frame, read page by page, so that memory does not grow with the scan."""
+"""TIFF stacks: one file with a page for each frame, read page by page, so that the memory needed does not grow with
+the scan.
+"""
 
 from __future__ import annotations
 

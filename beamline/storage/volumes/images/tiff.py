@@ -1,4 +1,4 @@
-"""TIFF: all slices in one file, or a folder with a file for each."""
+"""TIFF volumes: all slices in one file, or a folder with one file per slice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Cathode: grains packed in electrolyte in a can, with a current collector below and a separator above if asked for."""
+"""Cathode: grains packed in electrolyte in a can, with a current collector below and, if asked for, a separator
+above.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Foam: a cylinder or box of matter with many round holes that do not touch, from large to small ones.
+"""Foam: a cylinder or box of material with many round holes that do not touch, placed from large to small.
 
 Of many random points, each hole takes the one with most room. The idea is by Pelt, Hendriksen and Batenburg
 ("Foam-like phantoms for comparing tomography algorithms", J. Synchrotron Rad. 29, 2022).

@@ -1,4 +1,4 @@
-"""Pieces: solids with their roles in a phantom, which a change in time may move or charge."""
+"""Pieces: solids with their roles in a phantom; a change in time may move them or change their charge."""
 
 from __future__ import annotations
 
