@@ -22,7 +22,7 @@ WAITING_BYTES = 1_000_000_000  # memory for frames that wait to be written
 WAITING_FRAMES = (4, 128)  # least and most frames
 CHECKED_FRAMES = 2  # most frames that wait between the recorder's threads
 EVENT_INTERVAL = 0.1  # real s between `frame` events
-RATE_FRAMES = 20  # the rate is that of the last so many frames
+RATE_FRAMES = 20  # number of last frames from which the rate is computed
 
 
 def room(timeline: Timeline) -> int:
@@ -72,12 +72,12 @@ def hold_for_space(pause: PauseRequest, reserve: int, free: int, left: int) -> N
 
 
 def hold_for_backlog(pause: PauseRequest, most: int, waiting: int, checking: float, writing: float) -> None:
-    """Pause a fly scan before the queue is full, until few frames wait to be written.
+    """Pause a fly scan before the queue is full, until only few frames wait to be written.
 
     Args:
-        most: frames that may wait.
-        waiting: frames that do.
-        checking, writing: busy s of the recorder's threads; the disk is behind if writing took longer.
+        most: limit for the number of waiting frames.
+        waiting: number of waiting frames.
+        checking, writing: busy s of the recorder's threads; the disk is too slow if writing took longer.
     """
     if 4 * waiting >= 3 * most:
         what, advice = (
@@ -102,7 +102,8 @@ class FrameProgress:
 
     def __init__(self, timeline: Timeline) -> None:
         self.total, self._bytes = timeline.n_frames, timeline.frame_bytes
-        # Moves are spread over the frames, so that the time left always falls, also after a wait for the operator.
+        # The time for moves is spread over the frames, so that the time left always decreases, also after a wait for
+        # the operator.
         periods = np.concatenate([np.full(block.n_to_take, block.period) for block in timeline.blocks])
         self._ahead = timeline.duration * np.append(np.cumsum(periods[::-1])[::-1], 0.0) / periods.sum()
         self._times: deque[float] = deque(maxlen=RATE_FRAMES)
@@ -121,7 +122,7 @@ class FrameProgress:
         self.total -= left - done
 
     def update(self, frame: Frame, n: int, mean: float) -> FrameStored | None:
-        """Enter the n-th frame; None where the last event was less than EVENT_INTERVAL ago."""
+        """Record the n-th frame; None if the last event was less than EVENT_INTERVAL ago."""
         self._times.append(frame.time)
         now = time.monotonic()
         if now - self._last_event < EVENT_INTERVAL and n < self.total:

@@ -99,13 +99,14 @@ class Verb(StrEnum):
 def verbs_taken(
     folder: Path, stop: StopRequest, pause: PauseRequest, choose: Callable[[Choice], None] = lambda choice: None
 ) -> Iterator[None]:
-    """A context in which the scan of this folder obeys commands, by files in a folder that only its owner can enter.
+    """A context in which the scan of this folder obeys commands, which are files in a folder that only its owner can
+    enter.
 
     Args:
-        choose: takes what the operator has chosen to be measured next.
+        choose: takes the operator's choice of what is measured next.
 
     Raises:
-        DataError: the disk does not take the folder for them.
+        DataError: the folder for the commands cannot be created.
     """
     place, over = folder / CONTROL, threading.Event()
     actions: Mapping[Verb | Choice, Callable[[], None]] = {
@@ -184,10 +185,11 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
     """Send a command to a running scan without waiting, so that the next command can follow at once.
 
     Args:
-        verb: what the scan is to do; or a choice of what it measures next, which it takes only while it asks.
+        verb: what the scan is to do; or a choice of what it measures next, which it accepts only while it waits for a
+            decision.
 
     Raises:
-        ConfigError: no scan runs there, or it does not ask.
+        ConfigError: no scan runs there, or it is not waiting for a decision.
         DataError: the request cannot be made.
     """
     part = parts_of(run)[-1]
@@ -210,7 +212,9 @@ def ask(run: Path, verb: Verb | Choice) -> Asked:
 
 
 def tell(run: Path, verb: Verb | Choice) -> State:
-    """Send a command to a running scan, and wait until it is done; returns the state. Raises as `ask` and `Asked`."""
+    """Send a command to a running scan, and wait until it is done; returns the state. Raises the errors of `ask` and
+    `Asked`.
+    """
     asked = ask(run, verb)
     while (state := asked.state()) is None:
         time.sleep(POLL)
@@ -218,7 +222,7 @@ def tell(run: Path, verb: Verb | Choice) -> State:
 
 
 def state_of(part: Path) -> State:
-    """The state of the scan in this folder, by its record; `failed` where its process has died."""
+    """The state of the scan in this folder, from its record; `failed` if its process was killed."""
     record, states = read_record(part), {DIED: State.FAILED, **{state.value: state for state in State}}
     return State.IDLE if record is None else states.get(record.state, State.IDLE)
 

@@ -20,12 +20,12 @@ class FlaggedFrames:
     """The flags of the frames so far.
 
     Args:
-        sink: takes `FrameFlagged`, where a check begins to flag or its level changes, not for every frame.
-        react: told the flags of each frame.
-        retaken_warnings: checks whose warnings have views taken again.
+        sink: takes `FrameFlagged` if a check begins to flag or its level changes, not for every frame.
+        react: gets the flags of each frame.
+        retaken_warnings: checks whose warnings also cause projections to be taken again.
 
     Attributes:
-        retaken: views that were taken again.
+        retaken: projections that were taken again.
     """
 
     def __init__(
@@ -89,7 +89,8 @@ class AlarmReaction:
     """What the monitor's alarms do to a scan.
 
     Args:
-        act_after: frames in a row with an alarm of a check, after which its policy is carried out; again after so many.
+        act_after: number of consecutive frames with an alarm of a check after which its policy is carried out; and
+            again after as many.
         policies: by the name of the check.
     """
 

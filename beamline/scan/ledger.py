@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from beamline.core.errors import DataError
 
-FREE = 0.35  # periods by which a frame may be off its trigger; further off, no trigger exposed it
-NEAR = 0.1  # periods; a frame that is earlier than its trigger by more waits for the next, which may be nearer
-CONFIRMED = 0.2  # periods; the same for a frame of a stage that brakes
+FREE = 0.35  # periods by which a frame may be away from its trigger; a frame further away was not exposed by a trigger
+NEAR = 0.1  # periods; a frame that is earlier than its trigger by more waits for the next frame, which may be nearer
+CONFIRMED = 0.2  # periods; the same for a frame taken while the stage brakes
 KNOWN = 0.25  # periods: largest error of the first trigger's time that still identifies the first frame
 TRAIN, LOOK = 3, 6  # frames that make a train, and the most frames searched for one
 UNEVEN = 0.25  # periods; frames of a train are more regular than this
@@ -218,7 +218,7 @@ def start_known(train: Train) -> bool:
 
 
 def _off(ledger: Ledger, trigger: int, time: float) -> float:
-    """Periods from the time when its trigger was expected to a frame; negative: it came before."""
+    """Periods from the expected time of a frame's trigger to the frame; negative: the frame came before."""
     if ledger.last >= 0:
         return (time - ledger.phase) / ledger.period - (trigger - ledger.last)
     return 0.0 if ledger.train.first is None else (time - ledger.train.first) / ledger.train.period - trigger

@@ -10,7 +10,7 @@ from beamline.plan.plan import Mode, ScanPlan, one_way
 
 # Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
 _A_RAY, _A_VOXEL = 40, 50
-_WIDEST = 512  # columns: a wider volume does not grow as fast as views come, on any processor
+_WIDEST = 512  # columns: no processor can reconstruct a wider volume as fast as projections arrive
 _FEWEST = 90  # views
 _SHARE = 0.5  # share of the free memory
 _PASSES = range(8, 1, -1)  # of an interlaced scan, the best first
@@ -23,7 +23,7 @@ class LivePlan:
     """The part of a scan that its live volume uses."""
 
     binning: int = 1  # binning of rows and columns
-    every: int = 1  # one of so many views, in the order taken
+    every: int = 1  # one projection in N is used, in the order taken
     bytes: int = 0  # of memory, about
 
     @property
@@ -56,8 +56,9 @@ def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
 
 
 def better_order(plan: ScanPlan) -> tuple[str, ...]:
-    """A sentence that recommends an order of views with a better live volume before the end; empty if the plan has
-    it."""
+    """A sentence that recommends an order of angles with a better live volume before the end; empty if the plan already
+    has it.
+    """
     angles = plan.angles[:: plan.frames_per_view]
     if not one_way(angles) or angles.size < _FEWEST:
         return ()

@@ -70,8 +70,9 @@ class Measurement:
 
     Attributes:
         began: when the run did, on the monotonic clock.
-        series: the run that goes on, if one does.
-        source_of: makes what delivers the frames where others control the scan; None: we do, with the devices.
+        series: the run that is continued, if any.
+        source_of: makes the object that delivers the frames if another program controls the scan; None: this program
+            does, with the devices.
         child: starts the live reconstruction.
     """
 
@@ -214,7 +215,7 @@ class Measurement:
     ) -> None:
         if self.config.simulation is None and self.source_of is None:
             self._wait_for(follower)
-        # Closing the iterator is what makes the instrument safe when the recorder fails.
+        # Closing the iterator makes the instrument safe if the recorder fails.
         with closing(acquisition.frames()) as frames:
             for frame in frames:
                 self.decider.began = min(self.decider.began, frame.time)
@@ -223,7 +224,7 @@ class Measurement:
                 recorder.put(frame)
 
     def _wait_for(self, follower: LiveReconstruction | None) -> None:
-        """Wait until the live reconstruction is ready for views."""
+        """Wait until the live reconstruction is ready for projections."""
         if follower is not None:
             follower.wait_ready(
                 READY_WITHIN, lambda: self.stop.stopping, lambda text: self.states.enter(self.states.state, text)
@@ -290,7 +291,7 @@ class Measurement:
         )
 
     def _retakes(self, recorder: Recorder, missing: Sequence[int]) -> Sequence[Retake]:
-        """Views that were flagged for it or gave no frame, which are announced."""
+        """Projections that are taken again because they were flagged or gave no frame; they are announced."""
         chosen, n_bad = self._to_retake(recorder, missing)
         if not chosen:
             return ()
@@ -307,14 +308,16 @@ class Measurement:
         return chosen
 
     def _to_retake(self, recorder: Recorder, missing: Sequence[int]) -> tuple[Sequence[Retake], int]:
-        """Views that may be taken again now, and how many were flagged or gave no frame: of more than the plan still
-        allows, an even spread."""
+        """Projections that may be taken again now, and how many were flagged or gave no frame. If more than the plan
+        allows, an even selection.
+        """
         allowed = self.ready.plan.retakes - recorder.announced - self.decider.retaken
         if allowed <= 0:
             return (), 0
         recorder.wait()
         flagged = recorder.flagged.views_to_retake
-        once = [view for view in flagged if view.trigger < self.ready.plan.angles.size]  # others were taken again
+        # the others were already taken again
+        once = [view for view in flagged if view.trigger < self.ready.plan.angles.size]
         bad = sorted([*once, *(Retake(-1, trigger) for trigger in missing)], key=lambda view: view.trigger)
         return ((), 0) if self.stop.stopping else (spread_retakes(bad, allowed), len(bad))
 
@@ -327,8 +330,9 @@ def wait_in_pause(recorder: Recorder) -> bool:
 
 
 class _Ending:
-    """The error that ends a run, raised after everything is closed: any other one before a stop or lost frames, which
-    become a warning."""
+    """Collects the error that ends a run, and raises it after everything is closed. Any other error has precedence over
+    a stop or lost frames, which become a warning.
+    """
 
     def __init__(self, sink: Sink) -> None:
         self._sink = sink
@@ -336,7 +340,7 @@ class _Ending:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """A step whose failure does not keep the next ones from being taken."""
+        """A step whose failure does not prevent the next ones."""
         try:
             yield
         except BaseException as after:

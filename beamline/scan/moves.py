@@ -20,7 +20,7 @@ from drivers.base.frame import FrameKind
 from drivers.base.protocols import Devices, Rechecked, RotationStage
 
 WRITTEN = "Writing the last frames"  # Message of the state `finishing`
-SAFE = "Stage stopped, shutter closed; writing the last frames"  # The same with devices of ours
+SAFE = "Stage stopped, shutter closed; writing the last frames"  # the same for devices of this program
 UNSAFE = (
     "DANGER: stage, camera or shutter did not respond at the end of the scan. Check the instrument "
     "before anybody goes near the beam; writing the last frames"
@@ -66,7 +66,10 @@ def stand(stage: RotationStage, clock: Clock, stop: StopRequest) -> None:
 
 def looked_again(stage: RotationStage, angle: float, before: float) -> tuple[float, str]:
     """Where the stage was while a frame was exposed that should be at `angle`, and what is wrong with that, if
-    anything. The frame is there, and the stage stood at `before` (rad) when its exposure began."""
+    anything.
+
+    The frame exists, and the stage was at `before` (rad) when its exposure began.
+    """
     moving, after = stage.moving(), stage.position()
     wanted, most = stage.to_counts(angle), stage.limits.tolerance
     if not moving and all(abs(stage.to_counts(place) - wanted) <= most for place in (before, after)):
@@ -98,10 +101,10 @@ def set_shutter_and_sample(devices: Devices, block: Block, warm_up: Callable[[],
 
 
 def remembered_places(devices: Devices, kind: FrameKind, stop: StopRequest) -> dict[str, Callable[[], str]]:
-    """Tests of whether each device stays where this kind of frame needs it, by its name."""
+    """Functions that test whether each device stays where this kind of frame needs it, by its name."""
     shutter, remembered = devices.shutter, dict[str, Callable[[], str]]()
     if not shutter.by_hand:
-        # A scan that is stopped in a pause ends with a closed one.
+        # A scan that is stopped in a pause ends with a closed shutter.
         remembered[shutter.name] = lambda: "" if stop.stopping else _wrong_shutter(kind, shutter.is_open())
     for device in (devices.sample, devices.filter, devices.monochromator):
         if isinstance(device, Rechecked) and kind is not FrameKind.DARK:
@@ -138,7 +141,7 @@ def make_safe(
         home: where the stage goes then, after the sample is back, rad; None: both stay.
 
     Returns:
-        the first error of each step, and whether stage, camera or shutter may be as during the scan.
+        The first error of each step, and True if stage, camera or shutter may still be as during the scan.
     """
     stage, camera, shutter = devices.stage, devices.camera, devices.shutter
     failed: list[BaseException] = []
@@ -173,5 +176,5 @@ def make_safe(
 
 
 def in_words(error: BaseException) -> str:
-    """The message of an error; with its type if it is not ours."""
+    """The message of an error; with its type if it is not an error of this program."""
     return str(error) if isinstance(error, DeviceError | BeamlineError) else f"{type(error).__name__}: {error}"

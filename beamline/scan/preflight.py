@@ -110,7 +110,7 @@ class DryRun:
 
 
 def doubts(config: Config) -> list[str]:
-    """Warnings of implausible values, as from a mistaken unit; empty if all are plausible."""
+    """Warnings of implausible values, for example because of a wrong unit; empty if all are plausible."""
     theta = np.degrees(plan_of(config).angles)
     ends = float(np.ptp(theta))
     spans = getattr(config.scan.angles, "span_deg", ends), ends, ends * theta.size / max(theta.size - 1, 1)
@@ -122,11 +122,13 @@ def doubts(config: Config) -> list[str]:
     return [sentence for sentence in dict.fromkeys(sentences) if sentence]
 
 
-_DEMAGNIFIED = 100  # pixels at the sample over those of the camera: no optics images a field so much larger
+_DEMAGNIFIED = 100  # ratio of the pixel size at the sample to that of the camera; no optics demagnifies more
 
 
 def _doubt_optics(config: Config) -> str:
-    """A sentence where pixel size and distance cannot go with the camera, as by another unit; "" where they can."""
+    """A sentence if pixel size and distance do not match the camera, for example because of a wrong unit; otherwise
+    empty.
+    """
     optics, camera, own = config.optics, config.devices.camera, 1e3 * PITCH_MM
     settings = camera_settings(config, config.scan.exposure_s, TriggerSource.EXTERNAL)
     half = 5e-4 * optics.pixel_size_um * camera.binning * camera.timing_of(settings).shape[1]  # mm, of the field
@@ -154,16 +156,16 @@ def dry_run(
     """Compute the plan of a configuration without devices.
 
     Args:
-        runs: where the file would be, for the free disk; the configured folder unless given.
+        runs: where the file would be, for the free disk space; default: the configured folder.
         remaining: the part of the plan that is still to be taken.
-        whole: energies (keV) of a series that were taken already; not all of them.
+        whole: energies (keV) of a series that were already taken; not all of them.
 
     Raises:
-        ConfigError: angles, a scene or device settings that cannot be. Broken limits are no error
-            here: they are the timeline's violations.
+        ConfigError: impossible angles, scene or device settings. Exceeded limits are not an error here: they are the
+            timeline's violations.
     """
     each = [one for one in at_energies(settings) if one.scan.energy not in whole]
-    if len(each) > 1:  # a scene is read at both ends of the range
+    if len(each) > 1:  # a scene is read at both ends of the energy range
         connect.describe(max(each, key=lambda one: one.scan.energy or 0.0))
     stage, camera, to_counts = connect.describe(min(each, key=lambda one: one.scan.energy or 0.0))
     there = disk_of(runs or Path(settings.storage.folder))
@@ -208,7 +210,7 @@ def _worked(
 
 
 def _lockable(worked: Timeline, folder: Path) -> Timeline:
-    """The plan, with a violation where files in the folder cannot be locked."""
+    """The plan, with a violation if files in the folder cannot be locked."""
     no_locking = no_locks(folder)
     return replace(worked, violations=(*worked.violations, no_locking)) if no_locking else worked
 
@@ -226,7 +228,7 @@ def disk_of(folder: Path) -> Path:
     """`folder`, or its nearest existing parent, which is on the same disk.
 
     Raises:
-        ConfigError: a file stands in the way, or there is no such disk.
+        ConfigError: a file has this name, or the disk does not exist.
     """
     folder = folder.absolute()
     if link := broken_link(folder):
@@ -297,7 +299,7 @@ def ready_scan(
 ) -> ReadyScan:
     """A planned scan with the monitor before its first frame; sections `monitor` and `storage` of `config` count."""
     monitor = start_monitor(_context(timeline.plan, timeline, timing, info), configured_checks(config.monitor))
-    # The first call compiles, which must not happen while frames are coming.
+    # The first call compiles, which must not happen while frames arrive.
     check_stop()
     digests(np.zeros(timing.shape, np.uint16), monitor.context.saturation, config.storage.preview_bin)
     check_stop()

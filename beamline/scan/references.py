@@ -15,7 +15,7 @@ from drivers.base.frame import Frame, FrameKind
 from recon.base.choices import FEW_PHOTONS
 
 REFERENCES = (FrameKind.DARK, FrameKind.FLAT)
-VIEWS = 4  # enough for a median
+VIEWS = 4  # projections that are enough for a median
 
 
 class ReferenceLog:
@@ -34,10 +34,10 @@ class ReferenceLog:
             self.evidence = self.evidence.without({frame.replaces})
 
     def faults(self, limits: ReferenceLimits, planned: Sequence[Block] = ()) -> dict[str, str]:
-        """What is wrong with darks and flats so far, by what it is of, in one or more sentences each.
+        """What is wrong with darks and flats so far, by kind, in one or more sentences each.
 
         Args:
-            planned: blocks that are over by now; references without any frame are missing.
+            planned: blocks that are over by now; darks or flats without any frame are missing.
         """
         missing = {
             block.kind.name: f"The {block.n} {block.kind.name.lower()}s planned before the projections were not taken."

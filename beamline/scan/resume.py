@@ -52,17 +52,18 @@ class ResumableRun:
 
     Attributes:
         run: its folder.
-        lock: keeps other processes from recovering the run or going on with it.
+        lock: keeps other processes from recovering or continuing the run.
         config: its configuration.
-        parts: its files so far, each with a frame at least.
-        views: of the plan, in these files, or decided against.
-        planned: views of the whole plan.
-        offset: triggers of the offset views in these files; offset_missing: how many the plan still has.
+        parts: its files so far, each with at least one frame.
+        views: planned projections that are in these files, or that the scan decided to omit.
+        planned: projections of the whole plan.
+        offset: triggers of the offset projections in these files; offset_missing: how many the plan still has.
         choices: after each pass that ended in them, oldest first.
-        choice_due: the last one ended, and nothing was chosen yet.
-        seconds: that they took, from the first frame of each to its last one.
-        retaken: views that they took again, in place of others.
-        end_references: missing kinds of references after the views, if no view is missing; None if views are.
+        choice_due: the last pass ended, and nothing was chosen yet.
+        seconds: duration of the files, from the first frame of each to its last one.
+        retaken: projections that they took again, in place of others.
+        end_references: missing kinds of darks and flats after the projections, if no projection is missing; None if
+            some are.
         last_frame_time: time of the last frame, s since the Unix epoch.
         left_out: a sentence on each part that is not used.
     """
@@ -94,7 +95,7 @@ class ResumableRun:
             return (
                 f"Preparing: {self.run} has all {all_views}; its missing {' and '.join(kinds)} of the end are taken now"
             )
-        if self.choices:  # some views were decided against, or are taken twice
+        if self.choices:  # some projections were omitted by a decision, or are taken twice
             return f"Preparing: {self.run} lacks {missing} of the projections that it was to take; they are taken now"
         return f"Preparing: {self.run} has {len(self.views)} of {self.planned} projections; {missing} are taken now"
 
@@ -105,10 +106,10 @@ class ResumableRun:
         return replace(plan, stored=stored, choices=self.choices, choice_due=self.choice_due, end_references=references)
 
     def begin(self, ready: ReadyScan) -> Path:
-        """Recover parts whose writer died, join the parts, and create the folder of the new part.
+        """Recover parts whose process was killed, join the parts, and create the folder of the new part.
 
         Raises:
-            ConfigError: plan, frames or devices are not what they were; nothing was changed.
+            ConfigError: plan, frames or devices have changed; nothing was written.
             DataError: a part cannot be recovered, or the parts cannot be joined.
         """
         with hdf5.open_hdf5(self.parts[0]) as first, hdf5.readable(self.parts[0]):
@@ -147,8 +148,8 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
         given: a configuration that must be the run's.
 
     Raises:
-        ConfigError: it is no run, a process has it in work, or its configuration differs. NothingMissing, NoFrame, and
-            NotJoined where `recover_run` is all that it lacks.
+        ConfigError: it is not a run, another process is working on it, or its configuration differs. NothingMissing,
+            NoFrame, or NotJoined if only `recover_run` is needed.
         DataError: a file of it cannot be read. In all these cases nothing was changed.
     """
     if absent := [name for name in (SCAN, CONFIG, EVENTS) if not (run / name).is_file()]:
@@ -159,10 +160,10 @@ def open_for_resume(run: Path, given: Config | None = None) -> Iterator[Resumabl
 
 @contextmanager
 def _alone(run: Path) -> Iterator[WriterLock]:
-    """A context in which no other process recovers the run or goes on with it.
+    """A context in which no other process recovers or continues the run.
 
     Raises:
-        ConfigError: a process takes it, recovers it or goes on with it; or it cannot be written to.
+        ConfigError: a process is taking, recovering or continuing it; or it is write-protected.
     """
     try:
         lock = WriterLock(run / EVENTS, exclusive=True)
@@ -200,12 +201,12 @@ def _series(run: Path, given: Config | None, lock: WriterLock) -> ResumableRun:
                 raise DataError(f"The missing projections are unknown, because {part} has no plan. {_UNTOUCHED}")
             planned = angles
             if file[layout.COMMITTED][()]:
-                table = frames_in(file)  # a damaged one is named
+                table = frames_in(file)  # the error names a damaged file
                 parts.append(part)
                 closed = closed and bool(file[layout.FINISHED][()])
                 times.append(file[layout.TIME][()])
                 numbers = table.triggers[table.views]
-                retaken += int((numbers >= planned).sum())  # which count on from those of the plan
+                retaken += int((numbers >= planned).sum())  # their numbers continue after those of the plan
     if not parts:
         raise NoFrame(f"{run} has no frame: start the scan again. {_UNTOUCHED}")
     with ExitStack() as opened, hdf5.readable(run):
@@ -278,20 +279,21 @@ def _devices_differing(stored: h5py.File, ready: ReadyScan) -> Iterator[tuple[st
 
 
 def recover_run(run: Path, say: Callable[[str], None] = lambda _: None) -> tuple[list[Recovered], list[str]]:
-    """Recover every part of a run, and join several parts; the joined file comes last. The record of a run that died
-    then has the state of its newest file.
+    """Recover every part of a run, and join several parts; the joined file comes last.
+
+    The record of a run whose process was killed then gets the state of its newest file.
 
     Args:
-        say: takes a sentence on the room that each needs, before anything is written to it.
+        say: takes a sentence on the disk space that each needs, before anything is written to it.
 
     Returns:
-        the result for each file, and a sentence on each part that was left out.
+        The result for each file, and a sentence on each part that was left out.
 
     Raises:
-        ConfigError: a process takes it, recovers it or goes on with it.
+        ConfigError: a process is taking, recovering or continuing the run.
         DataError: no run, or a part that cannot be recovered; those before it are recovered.
     """
-    with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # copies of its files have no process
+    with _alone(run) if (run / EVENTS).is_file() else nullcontext():  # no process works on copies of its files
         files, left_out = _files(run)
         if not files:
             why = f"has no frame: {left_out[0]}" if left_out else f"is not the folder of a run: it has no {SCAN}."

@@ -34,13 +34,14 @@ def _wait_in_pause() -> bool:
 class Supervision:
     """Callbacks of the acquisition that pause a scan."""
 
-    # refusal: called once, before the first projection, when all earlier frames are recorded. Returns why no projection
+    # refusal: called once, before the first projection, when all earlier frames are recorded. Returns why no
+    # projection
     # should be taken; None: projections may be taken
     refusal: Callable[[], str | None] = lambda: None
-    # pause: checked before each frame of a standing stage, and all the time while it turns
+    # pause: checked before each frame of a stage at rest, and continuously while it turns
     pause: PauseRequest = field(default_factory=PauseRequest)
     # wait_in_pause: called repeatedly while the scan is paused. It waits a moment, and returns whether the operator at
-    # the terminal has let the scan go on
+    # the terminal has ended the pause
     wait_in_pause: Callable[[], bool] = _wait_in_pause
     # states: told the states of the scan
     states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
@@ -64,8 +65,8 @@ class BeamGuard:
 
     Args:
         pause_below: a reading below it pauses the scan, in the monitor's unit.
-        resume_above: readings of at least so much mean that the beam is back.
-        settle: s for which they must be so, before the scan goes on.
+        resume_above: readings of at least this value mean that the beam is back.
+        settle: s for which they must be so, before the scan continues.
     """
 
     def __init__(self, pause_below: float, resume_above: float, settle: float, pause: PauseRequest) -> None:
