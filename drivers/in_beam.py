@@ -53,7 +53,7 @@ class PlacedStage:
         return next((name for name in self._places.places if self._is_at(name)), None)
 
     def put(self, place: str, beside: float = 0.0) -> None:
-        """Move to a place, or `beside` radians beside it. Raises DeviceError if the stage did not arrive."""
+        """Move to a place, or `beside` radians next to it. Raises DeviceError if the stage did not arrive."""
         stage, speed, target = self._stage, self._places.speed, self._places.places[place] + beside
         try:
             if self._stands_at(target):
@@ -157,7 +157,7 @@ class OutputShutter:
         self._put(False)
 
     def is_open(self) -> bool:
-        """Whether the output holds the open level; without read-back, whether `open` was the last command sent.
+        """True if the output holds the open level; without read-back, whether `open` was the last command sent.
 
         False before the first command. Raises DeviceError.
         """

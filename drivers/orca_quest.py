@@ -2,9 +2,9 @@
 options.
 
 C15550-20UP (ORCA-Quest): limits and line times from the vendor's property table. C15550-22UP (ORCA-Quest 2) has the
-same sensor. Its line time in ultra quiet follows from 25.4 full frames a second. No public source states that of photon
-number resolving; the same is assumed. The values of a connected camera take precedence. Two rows are read together in
-one line time, so row r starts r / 2 line times after row 0.
+same sensor. Its line time in ultra quiet follows from 25.4 full frames per second. No public source states that of
+photon number resolving; the same is assumed. The values of a connected camera take precedence. Two rows are read
+together in one line time, so row r starts r / 2 line times after row 0.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from drivers.in_beam import Ask
 
 Say = Callable[[str], None]
 
-_OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each scan sets anew
+_OF_A_SCAN = ("roi", "binning", "readout")  # settings of the camera that each scan sets again
 
 
 ScanResult = RunResult  # what scripts get

@@ -239,7 +239,7 @@ class FoundMonochromator(_Monochromator):
 
     @property
     def stops(self) -> bool:
-        """Whether the monochromator can be stopped."""
+        """True if the monochromator can be stopped."""
         raise NotImplementedError
 
     def connect(self, clock: Clock) -> ConnectedMonochromator:

@@ -116,7 +116,7 @@ def _read_file(path: Path, printed_by: str) -> Tree:
 
 
 def takes_text(keys: Sequence[str], of: Mapping[str, Any] | None = None) -> bool:
-    """Whether a key of the configuration accepts any text, and nothing else but null; `of`: the JSON schema of
+    """True if a key of the configuration accepts any text, and nothing else but null; `of`: the JSON schema of
     another one."""
     legal = declared_at(schema() if of is None else of, tuple(keys), None)
     kinds = {None if "enum" in each or "const" in each else each.get("type") for each in legal}
@@ -132,7 +132,8 @@ def changed(config: Config, overrides: Iterable[str]) -> Config:
 def at_energies(config: Config) -> tuple[Config, ...]:
     """The configuration of a scan at each of `scan.energies`; a configuration without them itself.
 
-    The n-th of N scans begins n / N of a step later, or has another seed, so that all views together see more angles.
+    The n-th of N scans begins n / N of a step later, or has another seed, so that all projections together see more
+    angles.
     """
     scan, energies = config.scan, config.scan.energies
     if energies is None:
@@ -197,7 +198,7 @@ def plan_of(config: Config) -> ScanPlan:
     """The scan that a configuration asks for.
 
     Raises:
-        ConfigError: an angle file that cannot be read, or passes that do not divide the views.
+        ConfigError: an angle file that cannot be read, or passes that do not divide the projections.
     """
     scan = config.scan
     try:
@@ -356,8 +357,8 @@ def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> 
 
 
 def offset_places(config: Config) -> tuple[float, ...]:
-    """The sample's places in mm for offset views: by 0.9 of the field, until a twentieth of it shows air beyond the
-    sample on either side. ValueError: why it cannot be."""
+    """The sample's places in mm for offset projections: by 0.9 of the field, until a twentieth of it shows air beyond
+    the sample on either side. ValueError: why it cannot be."""
     mover, camera, diameter = config.devices.sample_mover, config.devices.camera, config.sample.diameter_mm
     if not config.scan.offset_views:
         return ()

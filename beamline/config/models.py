@@ -53,7 +53,7 @@ class _Span(Section):
 
 
 class FixedAngles(_Span):
-    """Equal steps from start_deg over span_deg; the end itself is excluded (180 views over 180 deg: 0 ... 179)."""
+    """Equal steps from start_deg over span_deg; without the end itself (180 projections over 180 deg: 0 ... 179)."""
 
     scheme: Literal["fixed"]
 
@@ -82,7 +82,7 @@ class InterlacedAngles(_Span):
 
 
 class GoldenAngles(_Span):
-    """Golden-ratio steps modulo span_deg: well spread after any number of views; step scans only."""
+    """Golden-ratio steps modulo span_deg: well spread after any number of projections; step scans only."""
 
     scheme: Literal["golden"]
 

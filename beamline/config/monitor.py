@@ -39,7 +39,7 @@ class MonitorBase(Section):
 
     @property
     def retaken_warnings(self) -> frozenset[str]:
-        """The checks whose warnings make the scan repeat a view."""
+        """The checks whose warnings make the scan repeat a projection."""
         return frozenset() if isinstance(self.retake, bool) else frozenset(self.retake)
 
 

@@ -69,7 +69,7 @@ def _inside(made: Setting, kind: Any, value: Any) -> Any:
 
 
 def _is(kind: Any, *kinds: type[Any]) -> bool:
-    """Whether it is a class of one of these kinds, and not a union."""
+    """True if it is a class of one of these kinds, and not a union."""
     return isinstance(kind, type) and issubclass(kind, kinds)
 
 

@@ -255,7 +255,7 @@ def describe(config: Config) -> tuple[StageLimits, CameraTiming, Callable[[float
     A simulated scene is read, too, so that its faults are reported now.
 
     Returns:
-        the stage's limits, the camera's timing with the views' exposure, and the stage's radians to whole counts.
+        the stage's limits, the camera's timing with the projections' exposure, and the stage's radians to whole counts.
 
     Raises:
         ConfigError: settings that a device would refuse, or a scene that is wrong.

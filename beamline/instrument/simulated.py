@@ -79,7 +79,7 @@ class SimulatedScene:
     cone: tuple[float, float] | None
     # labels: the anomalies of the frame, taken already, that was exposed at a time (s since the Unix epoch)
     labels: Callable[[float], Sequence[Label]]
-    # rehearse: makes a frame with the camera's present settings; ConfigError where the scene cannot be exposed so
+    # rehearse: makes a frame with the camera's present settings; ConfigError if the scene cannot be exposed so
     rehearse: Callable[[], None]
 
 

@@ -33,15 +33,15 @@ _VIEWS, _FAST_VIEWS = 360, 120  # of the slice; while a slider moves
 _MOST, _FAST_MOST = 768, 256  # voxels of the slice along a side
 _CENTRED = 1 / 8  # of the columns, from the detector's middle to an axis beyond which the field grows
 _BESIDE = 2  # rows beside that of the slice, by which the axis is found
-_MISSES = math.radians(2)  # by which a pair may miss half a turn
+_MISSES = math.radians(2)  # by which a pair may miss 180 degrees
 
 
 class _OverFlats:
-    """Views [view, row, col] as the share of the light that the sample lets through; as they are without flats.
+    """Projections [view, row, col] as the share of the light that the sample lets through; as they are without flats.
 
     Attributes:
         dark, flat: means [row, col] of the first darks and flats; None without.
-        light: [view] mean of each view that was read, else NaN.
+        light: [view] mean of each projection that was read, else NaN.
     """
 
     dtype = np.dtype(np.float32)
@@ -78,7 +78,7 @@ class ShownScan:
     """A scan, opened. All calls come from one thread (HDF5).
 
     Attributes:
-        stack: its views as slices: across views, rows and columns.
+        stack: its projections as slices: across projections, rows and columns.
 
     Raises:
         DataError: it has no projections.
@@ -98,8 +98,8 @@ class ShownScan:
         self._source.close()
 
     def facts(self) -> dict[str, Any]:
-        """Format and angles in a sentence, kinds of frames that have a mean, the mean light of each view so far (null:
-        not read), two views about half a turn apart and the degrees by which they miss it (null: none)."""
+        """Format and angles in a sentence, kinds of frames that have a mean, the mean light of each projection so far
+        (null: not read), two projections about 180 degrees apart and the degrees by which they miss it (null: none)."""
         known = self._degrees[np.isfinite(self._degrees)]
         angles = f"{known.min():.2f} to {known.max():.2f} degrees" if known.size else "angles unknown: give --angles"
         over = "shown as stored, because there are no flats" if self._views.flat is None else "over flats"
@@ -112,7 +112,7 @@ class ShownScan:
         }
 
     def mean(self, kind: str) -> F32:
-        """The mean [row, col] of the views that were read so far, or of the first flats or darks.
+        """The mean [row, col] of the projections that were read so far, or of the first flats or darks.
 
         Raises:
             DataError: the scan has no frames of this kind.
@@ -125,7 +125,7 @@ class ShownScan:
         """The axis of the file, or as one row shows it, in columns, and where it comes from; whether it may lean.
 
         Raises:
-            DataError: the views cannot be corrected, or have no angles.
+            DataError: the projections cannot be corrected, or have no angles.
         """
         self._read(row, 0.0)
         axis, said, is_cone = (self._source.shape[1] - 1) / 2, "the middle of the detector", self._cone is not None
@@ -138,12 +138,13 @@ class ShownScan:
         return {"axis": round(axis, 2), "said": said, "leans": not is_cone}
 
     def fbp(self, row: int, axis_col: float, tilt_deg: float, region: TileRegion, *, fast: bool) -> VolumeTile:
-        """A part of the slice that a row shows, by FBP with this axis; `fast`: of fewer views, with larger voxels.
+        """A part of the slice that a row shows, by FBP with this axis; `fast`: of fewer projections, with larger
+        voxels.
 
         Raises:
             DataError: as `axis`.
         """
-        from recon.voxels.direct import direct  # here: it loads numba, which slices of views do not need
+        from recon.voxels.direct import direct  # here: it loads numba, which slices of projections do not need
 
         self._read(row, tilt_deg)
         every = max(1, -(-len(self._ids) // _FAST_VIEWS)) if fast else 1
@@ -216,7 +217,7 @@ class ShownScan:
         self._row, self._beside, self._band = row, beside, band
 
     def _line(self, data: F32, row: int, tilt_deg: float) -> F32:
-        """The row [view, col] of views that are turned by the tilt, linear between pixels."""
+        """The row [view, col] of projections that are turned by the tilt, linear between pixels."""
         if not tilt_deg:
             return data[:, row - self._band.start]
         turned = TiltAndLens(tilt_deg).of(self._source, Selection().of(self._source))

@@ -63,7 +63,7 @@ def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float
 
 
 def lit(flat: NDArray[np.float32], dark: NDArray[np.float32] | float) -> NDArray[np.float32]:
-    """The flat with NaN where it has no light, as behind slits: ratios there are noise."""
+    """The flat with NaN if it has no light, as behind slits: ratios there are noise."""
     light = flat - dark
     return np.where(light > UNLIT * np.nanpercentile(light, BRIGHT), flat, np.float32(np.nan))
 

@@ -222,8 +222,9 @@ class ShownVolume:
         return not self._closed and any(one.read_more() for one in self._slices)
 
     def facts(self) -> dict[str, Any]:
-        """Name, shape, voxel along z, y, x and its unit, unit of values, method and why it is shown, views, angles of
-        the views that are the slices (empty: it is a volume) and of those that a sector lacks, windows of all times."""
+        """Name, shape, voxel along z, y, x and its unit, unit of values, method and why it is shown, projections,
+        angles of the projections that are the slices (empty: it is a volume) and of those that a sector lacks, windows
+        of all times."""
         windows = grey_windows(np.concatenate([self._sample(time) for time in range(len(self._slices))]))
         unit = self._length_unit
         return {

@@ -170,7 +170,7 @@ def locate_axis(
 
     If the estimate has no clear optimum, the axis stated in the file is used. If the file states none and the
     projections are `all_there`, held-out projections find the axis. They would mislead if only a part of the turn
-    was measured, or half a turn of a sample wider than the field of view.
+    was measured, or 180 degrees of a sample wider than the field of view.
 
     Raises:
         DataError: no axis in the search range explains the projections.
@@ -218,7 +218,7 @@ def _by_unseen_views(band: Projections, angles: NDArray[np.float64]) -> AxisEsti
     way either.
 
     A part without beam makes the axis uncertain by half a column, and by more if the sample also leaves the field of
-    view.
+    projection.
     """
     if band.data.shape[1] < band.data.shape[2] // COLS:
         return None  # columns would not be binned, and volumes would take minutes

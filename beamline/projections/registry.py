@@ -67,7 +67,7 @@ def in_order(selection: Selection) -> list[PrepStep]:
 
 
 def geometry_steps(selection: Selection) -> list[GeometryStep]:
-    """The steps that can find the geometry from the views, with the settings of the selection."""
+    """The steps that can find the geometry from the projections, with the settings of the selection."""
     return [step for step in in_order(selection) if isinstance(step, GeometryStep)]
 
 

@@ -1,4 +1,4 @@
-"""Selection: which part of a scan is used, with its views, rows, rotation axis and geometry."""
+"""Selection: which part of a scan is used, with its projections, rows, rotation axis and geometry."""
 
 from __future__ import annotations
 

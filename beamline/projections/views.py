@@ -100,7 +100,7 @@ class ViewGeometry:
                 self.learnt[step.name] = learnt
 
     def uncalibrated(self, part: ScanSelection, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of views without calibration."""
+        """The geometry of projections without calibration."""
         source = self.scan.source
         geometry = part.geometry(self.stated_axis, source.table.angles[view_ids])
         if (aside := source.table.aside) is not None:
@@ -111,7 +111,7 @@ class ViewGeometry:
         return geometry
 
     def of(self, view_ids: NDArray[np.int64]) -> Geometry:
-        """The geometry of views."""
+        """The geometry of projections."""
         geometry = self.uncalibrated(self.selection, view_ids)
         for learnt in self.learnt.values():
             geometry = learnt.corrected(geometry, view_ids)

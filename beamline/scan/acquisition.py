@@ -117,7 +117,7 @@ class Acquisition:
         if monochromator is not None and energy is not None and not self._stop.stopping:
             self._sink(StateEntered(self._supervision.states.state, f"Moving the monochromator to {energy:.7g} keV"))
             monochromator.move_to(energy)
-        enough = False  # the views
+        enough = False  # the projections
         for block in self._timeline.blocks:
             self._stop.refuse_abort()
             if not block.n_to_take:

@@ -97,7 +97,7 @@ def _matched(ledger: Ledger) -> int:
 
 
 def _ever_slower(ledger: Ledger, braking: Braking, frames: Sequence[DeliveredFrame]) -> bool:
-    """Whether the intervals between exposures grow from the last steady one on."""
+    """True if the intervals between exposures grow from the last steady one on."""
     steady = [
         DeliveredFrame(ledger.exposed, ledger.phase),
         *(frame for frame in frames if frame.time < braking.stop_sent),

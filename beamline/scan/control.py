@@ -43,7 +43,7 @@ class State(StrEnum):
 
     @property
     def ended(self) -> bool:
-        """Whether this state is final."""
+        """True if this state is final."""
         return not NEXT[self]
 
 
@@ -228,7 +228,7 @@ def state_of(part: Path) -> State:
 
 
 def _done(state: State, verb: Verb | Choice) -> bool:
-    """Whether a scan in this state has obeyed the verb."""
+    """True if a scan in this state has obeyed the verb."""
     if state is State.FINISHING or state.ended:
         return True
     if verb in (Verb.PAUSE, Verb.RESUME):

@@ -90,7 +90,7 @@ class Decider:
             self.sink(Warned(f"The choice {choice!s} had no effect: {expected}."))
 
     def __call__(self, passes: Passes) -> Choice:
-        """Decide what is measured next, after a wait for the error model and, if the operator is asked, for the answer."""
+        """Decide what is measured next, after a wait for the error model and, if asked for, the operator's answer."""
         self.number += 1
         if self._no_more_laws:
             return Choice.NEXT

@@ -52,7 +52,7 @@ class SeriesRun:
 
 
 def is_series(folder: Path) -> bool:
-    """Whether a folder contains a series of energies."""
+    """True if a folder contains a series of energies."""
     if not (folder / CONFIG).is_file() or (folder / SCAN).exists():
         return False
     return load(folder / CONFIG, environment={}).scan.energies is not None

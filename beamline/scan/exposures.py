@@ -327,5 +327,5 @@ class Exposures:
 
     @property
     def _interrupted(self) -> bool:
-        """Whether a stop or a pause is requested."""
+        """True if a stop or a pause is requested."""
         return self._stop.stopping or bool(self._supervision.pause.reason)

@@ -37,7 +37,7 @@ class FlaggedFrames:
         self._sink, self._react, self._retaken_warnings = sink, react, retaken_warnings
         self._flags: list[Flag] = []
         self._active: set[tuple[str, Level]] = set()
-        self._triggers: dict[int, int] = {}  # of the views, by row
+        self._triggers: dict[int, int] = {}  # of the projections, by row
         self._replaced: set[int] = set()
         self.retaken = 0
 
@@ -71,12 +71,12 @@ class FlaggedFrames:
 
     @property
     def alarmed_views(self) -> set[int]:
-        """The views among them."""
+        """The projections among them."""
         return self.alarmed & self._triggers.keys()
 
     @property
     def views_to_retake(self) -> list[Retake]:
-        """Views with an alarm or a warning that asks for a repetition, with the trigger that repeats each."""
+        """Projections with an alarm or a warning that asks for a repetition, with the trigger that repeats each."""
         warned = self._frames(lambda flag: flag.level is Level.WARN and flag.check in self._retaken_warnings)
         return [Retake(row, self._triggers[row]) for row in sorted((self.alarmed | warned) & self._triggers.keys())]
 

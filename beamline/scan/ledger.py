@@ -101,7 +101,7 @@ class Ledger:
 
     @property
     def complete(self) -> bool:
-        """Whether the last trigger has its frame, so that no more frames are expected."""
+        """True if the last trigger has its frame, so that no more frames are expected."""
         return self.last == self.train.n - 1
 
 
@@ -263,7 +263,7 @@ def _shift(ledger: Ledger, at_the_end: int | None) -> int:
     """The largest shift of all angles that the time of the first frame allows.
 
     Args:
-        at_the_end: triggers without a frame there; None where it is not known: then as many as the first frame's time
+        at_the_end: triggers without a frame there; None if it is not known: then as many as the first frame's time
             suggests.
     """
     if ledger.last < 0:

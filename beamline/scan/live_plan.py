@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from beamline.core.text import count, size
 from beamline.plan.plan import Mode, ScanPlan, one_way
 
-# Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 views.
+# Bytes of line integrals, fit and finish, measured with 128 x 256 pixels and 300 projections.
 _A_RAY, _A_VOXEL = 40, 50
 _WIDEST = 512  # columns: no processor can reconstruct a wider volume as fast as projections arrive
-_FEWEST = 90  # views
+_FEWEST = 90  # projections
 _SHARE = 0.5  # share of the free memory
 _PASSES = range(8, 1, -1)  # of an interlaced scan, the best first
 _SEQUENTIAL, _INTERLACED, _GOLDEN = "15.0, 19.6, 22.7", "22.0, 25.6, 27.6", "22.9, 26.0, 28.1"
@@ -32,10 +32,10 @@ class LivePlan:
 
 
 def live_plan(shape: tuple[int, int], n_views: int, free: int) -> LivePlan:
-    """Choose binning and omitted views so that the live volume has at most 512 columns and fits half of the free
+    """Choose binning and omitted projections so that the live volume has at most 512 columns and fits half of the free
     memory.
 
-    Views are left out as long as 90 are used, then the binning grows.
+    Projections are left out as long as 90 are used, then the binning grows.
 
     Args:
         shape: rows and columns of a frame.
@@ -77,13 +77,13 @@ def better_order(plan: ScanPlan) -> tuple[str, ...]:
 
 
 def live_bytes(shape: tuple[int, int], n_views: int, binning: int = 1) -> int:
-    """Estimated memory in bytes of a live volume of `n_views` views of this shape."""
+    """Estimated memory in bytes of a live volume of `n_views` projections of this shape."""
     rows, cols = (max(1, n // binning) for n in shape)
     return rows * cols * (_A_VOXEL * cols + _A_RAY * n_views)
 
 
 def live_need(shape: tuple[int, int], n_views: int, free: int) -> str:
-    """A sentence on the live volume: its views and pixels, its memory, and the reason for its size."""
+    """A sentence on the live volume: its projections and pixels, its memory, and the reason for its size."""
     plan = live_plan(shape, n_views, free)
     rows, cols = (max(1, n // plan.binning) for n in shape)
     views, most = math.ceil(n_views / plan.every), f"half of the {size(free)} of free memory"

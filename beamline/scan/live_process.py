@@ -47,7 +47,7 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
     """The command `beamline recon SCAN --follow` with the options of the configuration.
 
     Args:
-        earlier: files of the same scan, whose views come first.
+        earlier: files of the same scan, whose projections come first.
     """
     plan = plan or LivePlan()
     options = {**_common(config), "--seconds": config.recon.seconds}
@@ -60,7 +60,7 @@ def follow_command(config: Config, plan: LivePlan | None = None, earlier: Sequen
 
 
 def finished_command(config: Config) -> LiveCommand:
-    """The command `beamline recon SCAN` for the complete scan, for a method that needs all views."""
+    """The command `beamline recon SCAN` for the complete scan, for a method that needs all projections."""
     return lambda scan, output: _words(scan, [], {**_common(config), "-o": output})
 
 

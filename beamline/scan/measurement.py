@@ -50,7 +50,7 @@ class FrameSource(Protocol):
 
     Attributes, to be read after the last frame:
         missing: triggers, counted over the whole plan, that gave no frame.
-        recovered: views that gave no frame at first, but when they were repeated.
+        recovered: projections that gave no frame at first, but when they were repeated.
         unsafe: a device failed while the instrument was made safe.
     """
 

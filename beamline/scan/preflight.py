@@ -251,7 +251,7 @@ class ReadyScan:
 
     plan: ScanPlan
     timeline: Timeline
-    settings: CameraSettings  # of the camera for the views, as it accepted them
+    settings: CameraSettings  # of the camera for the projections, as it accepted them
     timing: CameraTiming  # of the camera with these settings
     monitor: Monitor  # before the first frame
     info: ScanInfo  # written into the file before the first frame

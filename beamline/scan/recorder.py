@@ -171,7 +171,7 @@ class Recorder:
 
     @property
     def hangs(self) -> bool:
-        """Whether a frame is still being written; after `finish` this means that the disk does not respond."""
+        """True if a frame is still being written; after `finish` this means that the disk does not respond."""
         return self._thread.is_alive()
 
     def _enqueue(self, item: Frame | _Call | None) -> None:

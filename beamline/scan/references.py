@@ -19,7 +19,7 @@ VIEWS = 4  # projections that are enough for a median
 
 
 class ReferenceLog:
-    """The evidence of the darks, the flats and the first views of a scan, as they are recorded."""
+    """The evidence of the darks, the flats and the first projections of a scan, as they are recorded."""
 
     def __init__(self) -> None:
         self.evidence, self._before = Evidence(), FrameKind.INVALID
@@ -48,8 +48,8 @@ class ReferenceLog:
         return missing | {f"{finding.rule} {spans(finding.frames)}": finding.message for finding in found}
 
     def too_little_light(self, limits: ReferenceLimits, exposure: float) -> str | None:
-        """A warning if noise would dominate the views, because a pixel of the open beam has few photons; or None.
-        `exposure`: s, of the views."""
+        """A warning if noise would dominate the projections, because a pixel of the open beam has few photons; or None.
+        `exposure`: s, of the projections."""
         bad = {row for finding in judge(self.evidence, limits) for row in finding.frames}
         good = self.evidence.without(bad)
         flats, darks = (next(iter(good.of_kind(kind)), None) for kind in (FrameKind.FLAT, FrameKind.DARK))
@@ -72,7 +72,7 @@ class ReferenceReport:
     """Warns of the faults of darks and flats, once for each group, and once of too little light.
 
     Args:
-        exposure: s, of the views.
+        exposure: s, of the projections.
     """
 
     def __init__(self, section: ReferencesSection, exposure: float, sink: Sink) -> None:

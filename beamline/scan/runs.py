@@ -58,7 +58,7 @@ class Run:
 
     @property
     def over(self) -> bool:
-        """Whether the run has ended; it may be resumed."""
+        """True if the run has ended; it may be resumed."""
         return self.state not in [state for state in State if not state.ended]
 
 

@@ -46,17 +46,20 @@ class Supervision:
     # states: told the states of the scan
     states: StateMachine = field(default_factory=lambda: StateMachine(state=State.PREPARING))
     # retakes: called with the triggers without a frame, after the last projection and where retakes were chosen;
-    # returns the views that are repeated now
+    # returns the projections that are repeated now
     retakes: Callable[[Sequence[int]], Sequence[Retake]] = lambda missing: ()
-    # wait_for_beam_reading: called after the last frame of flats and views: returns when it is known whether there was
+    # wait_for_beam_reading: called after the last frame of flats and projections: returns when it is known whether
+    # there was
     # beam
     wait_for_beam_reading: Callable[[], None] = lambda: None
-    # next_pass: called after each pass of views, offset views or retakes, if something is left; returns a possible
+    # next_pass: called after each pass of projections, offset projections or retakes, if something is left; returns a
+    # possible
     # choice. It may take its time, and close the shutter, which the next frames open. None: nothing is chosen
     next_pass: Callable[[Passes], Choice] | None = None
     # pass_ended: called before `next_pass`, and after the last pass, too; all frames were delivered
     pass_ended: Callable[[], None] = lambda: None
-    # n_retakable: called before `next_pass` with the triggers without a frame; how many views `retakes` would return
+    # n_retakable: called before `next_pass` with the triggers without a frame; how many projections `retakes` would
+    # return
     n_retakable: Callable[[Sequence[int]], int] = lambda missing: 0
 
 

@@ -14,9 +14,9 @@ from beamline.scan.ledger import Ledger
 from drivers.base.frame import FrameKind
 from drivers.base.protocols import CameraFrame
 
-NAMED = 5  # views that a sentence names
+NAMED = 5  # projections that a sentence names
 DOUBTFUL = 0.2  # steps: larger possible errors of an angle are reported
-TRIES = 3  # exposures of a view whose stage is not at its angle, after which the view counts as missing
+TRIES = 3  # exposures of a projection whose stage is not at its angle, after which the projection counts as missing
 ASTRAY_ADVICE = (
     f"Such a frame is kept as an invalid row, and its projection is taken again, up to {TRIES} times in "
     "total. Possible causes are another program or person that moves the stage, its manual knob, a servo "
@@ -32,7 +32,7 @@ class BlockTally:
     """A block with its frames and missing triggers; filled while the block is recorded.
 
     Attributes:
-        again: the block repeats views, so losing them is no failure.
+        again: the block repeats projections, so losing them is no failure.
         frames: delivered, with and without a trigger.
         rows: by trigger, counted within the block, the row and the time of its last frame.
         missing: triggers, counted within the block, whose expected frame did not come.
@@ -72,12 +72,12 @@ class BlockTally:
 
 
 def first_taken(done: Iterable[BlockTally]) -> list[BlockTally]:
-    """Tallies of the views, without those that repeat views."""
+    """Tallies of the projections, without those that repeat projections."""
     return [taken for taken in done if taken.block.kind is FrameKind.PROJECTION and not taken.again]
 
 
 def missing_views(done: Iterable[BlockTally]) -> tuple[int, ...]:
-    """Triggers of the views that gave no frame, in ascending order."""
+    """Triggers of the projections that gave no frame, in ascending order."""
     return tuple(sorted(i for taken in first_taken(done) for i in taken.missing))
 
 
@@ -109,7 +109,7 @@ def discrepancies(done: Sequence[BlockTally]) -> str:
 
 
 def _of_block(taken: BlockTally) -> str:
-    """Sentences on missing, extra and doubtful frames of a block; a view that was repeated misses none."""
+    """Sentences on missing, extra and doubtful frames of a block; a projection that was repeated misses none."""
     block, noun = taken.block, taken.block.kind.name.lower()
     text = ""
     if taken.missing and not taken.again:

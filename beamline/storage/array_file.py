@@ -21,7 +21,7 @@ METADATA = "zarr.json", ".zgroup", ".zarray"  # one of them is in the folder of 
 
 
 def is_zarr(path: Path) -> bool:
-    """Whether a folder is a Zarr store, written by any program."""
+    """True if a folder is a Zarr store, written by any program."""
     return any((path / name).is_file() for name in METADATA)
 
 
@@ -142,7 +142,7 @@ _PICKLES, _NUMPY = (".pickle", ".pkl", ".pck"), (".npy", ".npz")
 
 
 def holds_arrays(path: Path) -> bool:
-    """Whether a path is an .npy, an .npz or a Zarr. DataError: a pickle, whose arrays are read once converted."""
+    """True if a path is an .npy, an .npz or a Zarr. DataError: a pickle, whose arrays are read once converted."""
     if path.is_file() and path.suffix.lower() in _PICKLES:
         raise DataError(_PICKLE.replace("{0}", str(path)))
     return (path.suffix.lower() in _NUMPY and path.is_file()) or zarr_root(path) is not None

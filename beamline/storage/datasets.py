@@ -342,7 +342,7 @@ def _holds(drawn: h5py.Dataset, source: Any) -> bool:
 
 
 def _fills(drawn: h5py.Dataset, source: Any) -> bool:
-    """Whether all of a dataset has the shape of its place: some frames, or a stripe or tile of each."""
+    """True if all of a dataset has the shape of its place: some frames, or a stripe or tile of each."""
     place = source.vspace
     extent = place.shape
     if place.get_select_type() == h5py.h5s.SEL_HYPERSLABS and place.is_regular_hyperslab():
@@ -364,7 +364,7 @@ def require_possible(item: Any) -> int:
             f"{item.name} in {item.file.filename} is {' x '.join(map(str, item.shape))}; expected at most {_FRAMES} "
             f"frames of {_PIXELS} pixels."
         )
-    stored = getattr(item, "item", item)  # pieces of a Zarr are packed as a rule
+    stored = getattr(item, "item", item)  # pieces of a Zarr are packed usually
     packed = stored.id.get_create_plist().get_nfilters() if isinstance(stored, h5py.Dataset) else bool(stored.chunks)
     if (needed := _UNPACKING * piece_of(item) if packed else 0) > HELD and needed > (free := free_memory()):
         raise DataError(

@@ -43,7 +43,7 @@ class Mark:
 
     Attributes:
         bits: as `beamline.monitor.checks.bitmask` makes them.
-        scores: float32 [check], in the order of the legend; NaN where the check did not flag the frame, or only when
+        scores: float32 [check], in the order of the legend; NaN if the check did not flag the frame, or only when
             it saw later ones.
         regions: int32 [check, 4], first row, row after the last, first column, column after the last; -1: none.
     """
@@ -54,7 +54,7 @@ class Mark:
 
     @property
     def valid(self) -> bool:
-        """Whether no check raised an alarm."""
+        """True if no check raised an alarm."""
         return self.bits & ALARMS == 0
 
 
@@ -85,7 +85,7 @@ class FrameFlags:
         bits: uint64 [frame] as `beamline.monitor.checks.bitmask` makes them.
         legend: the checks behind the bits.
         scores: [frame, check] as in `Mark`.
-        regions: [frame, check, 4], likewise.
+        regions: [frame, check, 4], in the same way.
     """
 
     bits: NDArray[np.uint64]
@@ -133,12 +133,12 @@ class FrameFlags:
 
     @property
     def flagged(self) -> NDArray[np.bool_]:
-        """Whether a check flagged each frame [frame], at any level."""
+        """True if a check flagged each frame [frame], at any level."""
         return np.asarray(self.bits != 0)
 
     @property
     def alarmed(self) -> NDArray[np.bool_]:
-        """Whether a check raised an alarm for each frame [frame]."""
+        """True if a check raised an alarm for each frame [frame]."""
         mask = sum(1 << entry.alarm_bit for entry in self.legend)
         return np.asarray((self.bits & np.uint64(mask)) != 0)
 
@@ -198,7 +198,7 @@ class FrameFlags:
 
 
 def _greatest(scores: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[check] the scores [frame, check] farthest from 0; NaN where no frame has one."""
+    """[check] the scores [frame, check] farthest from 0; NaN if no frame has one."""
     at = np.where(np.isfinite(scores), np.abs(scores), -1).argmax(axis=0)
     return np.asarray(scores[at, np.arange(scores.shape[1])])
 

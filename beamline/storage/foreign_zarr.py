@@ -111,7 +111,7 @@ def _require_chunks(path: Path, array: Any) -> None:
 
 
 def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
-    """None where a unit or the size is not stated."""
+    """None if a unit or the size is not stated."""
     (mine,) = [each for each in image.get("datasets", []) if each["path"] == name] or [{}]
     steps = [*mine.get("coordinateTransformations", []), *image.get("coordinateTransformations", [])]
     scales = [numbers_of(step["scale"], axes, "scale")[-3:] for step in steps if step["type"] == "scale"]

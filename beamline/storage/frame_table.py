@@ -35,9 +35,9 @@ class FrameTable:
         altered: bool [frame], where the record differs from its checksum: such frames are INVALID.
         part_starts: int64 [part], ascending, the first row of each part; [0] if the scan was not interrupted. Between
             two parts beam and camera may have changed.
-        pass_ends: int64 [pass], rows at the end of each pass of views; empty where the scan has none.
+        pass_ends: int64 [pass], rows at the end of each pass of projections; empty if the scan has none.
         times: float64 [frame], s at the trigger.
-        replaces: int64 [frame], the row of the view that a frame repeats (the old row is then INVALID).
+        replaces: int64 [frame], the row of the projection that a frame repeats (the old row is then INVALID).
         numbers: int64 [frame], in the name of the file of each frame.
         aside: float64 [frame], mm, as of `Frame`.
         shifts: float64 [frame, 2], displacement of the image along (columns, rows) in pixels.
@@ -121,7 +121,7 @@ class FrameTable:
 
     @property
     def replaced(self) -> I64:
-        """Rows of the views that were repeated, ascending."""
+        """Rows of the projections that were repeated, ascending."""
         return _NONE if self.replaces is None else np.sort(self.replaces[self.replaces >= 0])
 
     def views_of(self, first: int, end: int) -> I64:
@@ -129,7 +129,8 @@ class FrameTable:
         return self.views[slice(*np.searchsorted(self.views, (first, end)))]
 
     def numbers_taken(self, first: int = 0, kind: int = FrameKind.PROJECTION) -> frozenset[int]:
-        """Numbers, from 0, of the planned views that were taken. A view taken again has the number of the first.
+        """Numbers, from 0, of the planned projections that were taken. A projection taken again has the number of the
+        first.
 
         Args:
             first: the row from which frames count.
@@ -147,7 +148,7 @@ class FrameTable:
         return FrameKind(int(self.kinds[row]))
 
     def has(self, *kinds: int) -> bool:
-        """Whether there is a frame of each of these kinds."""
+        """True if there is a frame of each of these kinds."""
         return set(kinds) <= {*self.kinds.tolist()}
 
     def frame(self, row: int, counts: NDArray[np.uint16], kind: FrameKind | None = None) -> Frame:
@@ -172,7 +173,7 @@ class FrameTable:
         return replace(self, kinds=kinds)
 
     def take(self, rows: I64) -> FrameTable:
-        """The frames of these rows, in that order. A view that repeats one which is not among them repeats none.
+        """The frames of these rows, in that order. A projection that repeats one which is not among them repeats none.
 
         Parts and passes are those of the frames that are left, if the rows ascend; in another order they mean nothing.
         """
@@ -215,7 +216,7 @@ _ARRAYS = [each.name for each in fields(FrameTable) if each.name not in ("part_s
 
 
 def _joined(each: Sequence[NDArray[Any] | None], sizes: Sequence[int]) -> NDArray[Any] | None:
-    """Values [frame, ...] of several tables, NaN (-1 of whole numbers) where one states none; None where none does."""
+    """Values [frame, ...] of several tables, NaN (-1 of whole numbers) where one states none; None if none does."""
     known = next((values for values in each if values is not None), None)
     if known is None:
         return None

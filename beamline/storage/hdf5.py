@@ -27,7 +27,7 @@ from beamline.storage.structure import require_harmless
 from beamline.storage.superblock import Superblock, superblock
 from beamline.storage.writer_lock import QUIET, WITHOUT, LockFailure, abandoned, lock_failure, opened_whole
 
-COMMITTED = "/entry/progress/frames_committed"  # of our own files
+COMMITTED = "/entry/progress/frames_committed"  # of this program's own files
 
 
 class NotReadyError(DataError):
@@ -39,7 +39,7 @@ class UnreadableError(DataError):
 
 
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
-    """Open for reading, even a file that is being written or whose writer died (SWMR).
+    """Open for reading, even a file that is being written or whose process was killed (SWMR).
 
     HDF5 shares a file within a program. A reader beside the writer would see half of the file, and write to it at the
     end. Two followers of one file would both read wrong values. So such a file gets a handle of its own.
@@ -73,7 +73,7 @@ def _ways(head: Superblock | None, follow: bool) -> list[tuple[bool, bool | None
     # A follower takes no lock, so as not to be taken for a writer.
     growing, whole, shared = (True, False), (False, None), (True, None)
     ways: list[tuple[bool, bool | None]] = [growing, whole, shared] if follow else [whole, growing, shared]
-    # HDF5 would wait for ever for a writer that mends what is missing or damaged
+    # HDF5 would wait for ever for a writer that repairs what is missing or damaged
     waits = head is None or head.missing or not (follow or head.open_for_writing)
     return [way for way in ways if not (way[0] and waits)]
 
@@ -108,7 +108,7 @@ def _unopened(
 
 
 def grows_here(path: Path) -> bool:
-    """Whether this program has the file open through HDF5's own driver, for writing or following it."""
+    """True if this program has the file open through HDF5's own driver, for writing or following it."""
     here = path.stat()
     for file in h5py.h5f.get_obj_ids(h5py.h5f.OBJ_ALL, h5py.h5f.OBJ_FILE):
         with suppress(OSError, RuntimeError, ValueError):  # another thread just closed it
@@ -120,8 +120,8 @@ def grows_here(path: Path) -> bool:
 
 
 def _apart(path: Path, head: Superblock | None, follow: bool) -> h5py.File:
-    """A file that this program writes, or whose writer died, opened by a driver that shares it with no other handle of
-    HDF5.
+    """A file that this program writes, or whose process was killed, opened by a driver that shares it with no other
+    handle of HDF5.
     """
     if head is None or (head.open_for_writing and not head.grows and not abandoned(path)):
         raise (NotReadyError if follow else DataError)(f"This program is still creating {path}. Try again.")
@@ -159,7 +159,7 @@ def n_written(item: Any) -> int:
 
 
 def is_hdf5(path: Path, follow: bool = False) -> bool:
-    """Whether the path is an HDF5 file: by its signature, at the start or after a user block.
+    """True if the path is an HDF5 file: by its signature, at the start or after a user block.
 
     h5py.is_hdf5 says no to a file that is being written. A path that does not exist, or that is followed, counts as
     HDF5: `open_hdf5` says what is wrong with it, or that it is not ready.
@@ -200,7 +200,7 @@ _CONTENT = r"array|bytes|unsized|'(Dataset|Datatype|Empty|Group|str)'"  # of a T
 
 
 def _of_our_own(error: Exception) -> bool:
-    """Whether a mistake of a reader raised it, and no library that met what it did not expect.
+    """True if a mistake of a reader raised it, and no library that met what it did not expect.
 
     A dataset where a group was expected lacks that group's attributes: the object is the file's then.
     """

@@ -145,7 +145,7 @@ def _step_of_run(run: Path) -> str:
 
 
 def is_ride(run: Path) -> bool:
-    """Whether a run recorded the scan of another program, which alone can take more of it."""
+    """True if a run recorded the scan of another program, which alone can take more of it."""
     config = run / CONFIG
     return config.is_file() and "\nride:" in config.read_text(encoding="utf-8", errors="replace")
 
@@ -159,7 +159,7 @@ def _died(sure: bool) -> str:
 
 
 def _lacks_views(run: Path) -> bool:
-    """Whether the files of a run, all closed, lack views that it was to take, wide ones included."""
+    """True if the files of a run, all closed, lack projections that it was to take, wide ones included."""
     with suppress(DataError, *hdf5.ALTERED), ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in files_with_frames(run)]
         return bool(still_to_take(files)[0]) or offset_planned(files[0]) > len(offset_taken(files))
@@ -167,7 +167,7 @@ def _lacks_views(run: Path) -> bool:
 
 
 def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str, ...], bool]:
-    """Views that a scan still has to take, by its plan and what it chose; nothing for a file without its plan.
+    """Projections that a scan still has to take, by its plan and what it chose; nothing for a file without its plan.
 
     Args:
         files: all of the scan, in the order that they were taken in, or the one that joins them.
@@ -175,7 +175,7 @@ def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str
     Returns:
         The triggers of these views, counted from 0: not those that the scan decided against, but those of a pass that
         it was taking again. What it chose after each pass that ended, `Choice.NEXT` where the files do not say. Whether
-        a choice is due: the last pass has ended, and neither a choice nor a view follows.
+        a choice is due: the last pass has ended, and neither a choice nor a projection follows.
     """
     views, since_pass_end, chosen, n_ended = set[int](), set[int](), dict[str, str](), 0
     for file in files:
@@ -196,19 +196,19 @@ def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str
 
 
 def n_still_to_take(file: h5py.File) -> int | None:
-    """How many views `still_to_take` has for a file; None: not known, as what it chose is damaged."""
+    """How many projections `still_to_take` has for a file; None: not known, as what it chose is damaged."""
     with suppress(*hdf5.ALTERED):
         return len(still_to_take([file])[0])
     return None
 
 
 def offset_taken(files: Sequence[h5py.File]) -> frozenset[int]:
-    """Triggers of the offset views in the files of a scan."""
+    """Triggers of the offset projections in the files of a scan."""
     return frozenset[int]().union(*(frames_in(file).numbers_taken(kind=FrameKind.OFFSET_VIEW) for file in files))
 
 
 def _passes_of(file: h5py.File, choices: Iterable[str]) -> Passes:
-    """The passes of a plan as a file holds it, after these choices. How many views a pass of a step scan has, its
+    """The passes of a plan as a file holds it, after these choices. How many projections a pass of a step scan has, its
     configuration says."""
     plan, config = plan_in(file), file["/entry/record/config"].asstr()[()]
     angles, stated = np.radians(plan["angles_deg"]), re.search(r"^  pass_views: (\d+)", config, re.MULTILINE)

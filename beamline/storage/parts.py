@@ -1,8 +1,8 @@
 """Parts: a resumed scan has several files. Finds which projections each contains, and joins them in one file.
 
 The joined file is an NXtomo of this program whose pixels are virtual (HDF5 virtual datasets, as in the /exchange
-view). It contains no frame itself, so it can be made again at any time. The files with the frames are never written
-again. It records name and number of frames of each part, so that a reader can check that it has all parts.
+projection). It contains no frame itself, so it can be made again at any time. The files with the frames are never
+written again. It records name and number of frames of each part, so that a reader can check that it has all parts.
 
 The joined file is an NXtomo of ours whose pixels are virtual (HDF5 virtual datasets, as in the /exchange view). It
 holds no frame itself, so it can be made again at any time. The files with the frames are never written again. It
@@ -45,13 +45,13 @@ _MADE_ANEW = (layout.EXCHANGE, layout.IMAGE_KEY_CONTROL, layout.FIELD_OF_VIEW)
 
 
 def views_planned(file: h5py.File) -> int | None:
-    """Number of planned views of the scan; None if the file does not contain its plan."""
+    """Number of planned projections of the scan; None if the file does not contain its plan."""
     angles = plan_in(file).get("angles_deg")
     return None if angles is None else len(angles)
 
 
 def offset_planned(file: h5py.File) -> int:
-    """Number of planned offset views of the scan."""
+    """Number of planned offset projections of the scan."""
     plan = plan_in(file)
     kind = "wide" if "wide_views" in plan else "offset"  # the name in files of earlier versions
     return int(plan.get(f"{kind}_views", 0)) * len(plan.get(f"{kind}_places_mm", ()))
@@ -63,7 +63,8 @@ def plan_in(file: h5py.File) -> dict[str, Any]:
 
 
 def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
-    """Triggers before the last view without a frame, judged by the frames themselves: for files whose writer died.
+    """Triggers before the last view without a frame, judged by the frames themselves: for files whose process was
+    killed.
 
     None of a later part of a run, which takes what the parts before lack, and of files without their plan.
     """
@@ -74,13 +75,13 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
     references = table.of_kind(FrameKind.DARK, FrameKind.FLAT)
     first = references[references < views[0]].max(initial=-1) + 1
     seen = table.triggers[first : views[-1] + 1]
-    seen = seen[seen < (views_planned(file) or 0)]  # offset views, and those taken again, count on from there
+    seen = seen[seen < (views_planned(file) or 0)]  # offset projections, and those taken again, count on from there
     gaps = np.setdiff1d(np.arange(seen.max(initial=0)), seen)
     return tuple((sum(_planned(file, "start").values()) + gaps).tolist())
 
 
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
-    """Kinds of references planned after the views that are missing, wholly or in part, in the files of a scan.
+    """Kinds of references planned after the projections that are missing, wholly or in part, in the files of a scan.
 
     Args:
         files: all of the scan, in the order that they were taken in.
@@ -90,7 +91,7 @@ def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
 
 
 def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
-    """Numbers of references planned at the "start" or the "end" of the views, in the order of acquisition at the
+    """Numbers of references planned at the "start" or the "end" of the projections, in the order of acquisition at the
     end."""
     plan = plan_in(file)
     fields = {FrameKind.FLAT: plan.get("flats", {}), FrameKind.DARK: plan.get("darks", {})}
@@ -98,7 +99,7 @@ def _planned(file: h5py.File, when: str) -> dict[FrameKind, int]:
 
 
 def _after_views(files: Sequence[h5py.File]) -> dict[FrameKind, set[int]]:
-    """Triggers, counted within their block, of the references after the last view of all files."""
+    """Triggers, counted within their block, of the references after the last projection of all files."""
     table = FrameTable.concat([frames_in(file) for file in files])
     after = table.views[-1] if table.views.size else len(table)
     rows = {kind: table.of_kind(kind) for kind in (FrameKind.FLAT, FrameKind.DARK)}
@@ -141,7 +142,7 @@ def files_with_frames(run: Path, name: str = SCAN) -> list[Path]:
 
 
 def may_hold_frames(part: Path) -> bool:
-    """Whether a part may have frames: its file has one, or its log of events (perhaps not all) names one.
+    """True if a part may have frames: its file has one, or its log of events (perhaps not all) names one.
 
     A part that ended before its first frame does not count.
     """
@@ -187,7 +188,7 @@ def require_joined(file: h5py.File) -> None:
 
 
 def is_joined(joined: Path) -> bool:
-    """Whether this file exists and has the frames of all parts of its scan."""
+    """True if this file exists and has the frames of all parts of its scan."""
     with suppress(DataError), hdf5.open_hdf5(joined) as file, hdf5.readable(joined):
         require_joined(file)
         return True
@@ -266,7 +267,7 @@ def copy_rows(file: h5py.File, n: int, target: hdf5.NewFile) -> tuple[int, ...]:
 
 
 def is_whole(file: h5py.File, row: int) -> bool:
-    """Whether the pixels of a row are as they were written, by their checksum."""
+    """True if the pixels of a row are as they were written, by their checksum."""
     with suppress(*hdf5.ALTERED):
         return has_checksum(file[layout.DATA][row], int(file["/entry/digest/checksum"][row]))
     return False

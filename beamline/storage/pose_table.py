@@ -27,7 +27,7 @@ from recon.base.arrays import F64
 from recon.base.vectors import geometry_of_vectors
 
 Key = Literal["frame", "view", "angle_deg"]
-IGNORE = "ignore"  # In place of a file: views count as not displaced, whatever their scan file says
+IGNORE = "ignore"  # In place of a file: projections count as not displaced, whatever their scan file says
 _KEYS: tuple[Key, ...] = "frame", "view", "angle_deg"
 _PIXELS = "shift_col_px", "shift_row_px"
 _TURNS = "roll_deg", "tilt_deg"
@@ -46,13 +46,13 @@ _HOW = (
 
 @dataclass(frozen=True, eq=False)
 class PoseTable:
-    """Poses of some views, in unbinned pixels.
+    """Poses of some projections, in unbinned pixels.
 
     Attributes:
         path: of the file.
-        by: what `keys` are: rows of the scan file, views counted from 0 in its order, or angles in degrees.
+        by: what `keys` are: rows of the scan file, projections counted from 0 in its order, or angles in degrees.
         keys: float64 [row], all different.
-        angles_deg: float64 [row] of the views, to be compared with the scan's; None where the file has none.
+        angles_deg: float64 [row] of the projections, to be compared with the scan's; None if the file has none.
         shifts: float64 [row, 2], displacement of the image along (columns, rows), in `unit`.
         turns_deg: float64 [row, 2], roll and tilt, as of `recon.base.geometry.Geometry`.
         unit: "px" of the unbinned detector, or "mm" at the sample.
@@ -76,7 +76,7 @@ class PoseTable:
 
     @property
     def leans(self) -> bool:
-        """Whether a row of a view may show several slices, because the view is rolled or tilted."""
+        """True if a row of a projection may show several slices, because the projection is rolled or tilted."""
         return self.vectors is not None or bool(self.turns_deg.any())
 
     def __str__(self) -> str:
@@ -189,7 +189,7 @@ def _require_keys(path: Path, columns: dict[str, F64], by: Key) -> None:
 
 
 def _of_arrays(path: Path) -> PoseTable:
-    """Vectors of all views, in an .npz under the name that ASTRA has for their kind."""
+    """Vectors of all projections, in an .npz under the name that ASTRA has for their kind."""
     with hdf5.readable(path):
         arrays = numpy_arrays(path)
     read = {name: values for name, values in arrays.items() if name in _ARRAYS}
@@ -245,7 +245,7 @@ POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
 
 
 def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> PoseTable:
-    """Translations of the sample, in mm from their median: a common one is no displacement of a view."""
+    """Translations of the sample, in mm from their median: a common one is no displacement of a projection."""
     places = choose(file, find(file))
     kinds = places.kinds()
     shown = kinds == FrameKind.PROJECTION
@@ -290,8 +290,8 @@ def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> Pose
 
 
 def write_poses(path: Path, volume: Path) -> tuple[int, float]:
-    """Write the poses of the views of a volume file as a CSV that `read_poses` reads; returns the number of views, and
-    the axis' column.
+    """Write the poses of the projections of a volume file as a CSV that `read_poses` reads; returns the number of
+    projections, and the axis' column.
 
     Raises:
         DataError: the volume holds none, `path` exists, or the disk refuses; nothing is left.

@@ -46,12 +46,12 @@ class Recovered:
     Attributes:
         changed: whether the file was changed.
         frames: committed, and kept.
-        dropped: frames at the end that were not committed when the writer died, and are cut off.
-        missing: views that were to be taken, by the plan and by what the scan chose, and were not; None where the file
-            does not hold its plan, and of a later part of a run, which others come before.
+        dropped: frames at the end that were not committed when the process was killed, and are cut off.
+        missing: projections that were to be taken, by the plan and by what the scan chose, and were not; None if the
+            file does not hold its plan, and of a later part of a run, which others come before.
         lost: frames that were committed and are not on the disk; they are cut off, with all after them.
         damaged: frames that differ from their checksum; they are kept.
-        altered: frames whose row in the log differs from its checksum; likewise kept.
+        altered: frames whose row in the log differs from its checksum; in the same way kept.
         remark: a step that failed although the frames are in order; "" if none failed.
     """
 
@@ -87,8 +87,8 @@ class Recovered:
 
 
 def recover(path: Path, say: Callable[[str], None] = lambda _: None) -> Recovered:
-    """Put a closed file with the committed frames in the place of one whose writer died, or that was cut off; add the
-    /exchange view where a closed one lacks it.
+    """Put a closed file with the committed frames in the place of one whose process was killed, or that was cut off;
+    add the /exchange view where a closed one lacks it.
 
     Args:
         say: takes a sentence on the room that the copy needs.

@@ -36,7 +36,7 @@ def require_harmless(file: h5py.File) -> None:
     """
     path = Path(file.filename)
     for name in dict.fromkeys(_names(file, path)):
-        # Where HDF5 looks for it: as it is named, beside this file, and by its last part beside it.
+        # Where HDF5 looks for it: as it is named, beside this file, and by its last part next to it.
         for place in (Path(name), path.parent / name, path.parent / Path(name).name):
             if place.is_dir():
                 continue

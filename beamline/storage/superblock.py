@@ -37,12 +37,12 @@ class Superblock:
 
     @property
     def open_for_writing(self) -> bool:
-        """Whether a program is writing the file, or died while writing."""
+        """True if a program is writing the file, or died while writing."""
         return self.head[_FLAGS] != 0
 
     @property
     def grows(self) -> bool:
-        """Whether the file is being written so that others may read it meanwhile (SWMR)."""
+        """True if the file is being written so that others may read it meanwhile (SWMR)."""
         return bool(self.head[_FLAGS] & _GROWS)
 
     @property
@@ -75,7 +75,7 @@ def superblock(path: Path) -> Superblock | None:
 
 
 def marked_as_being_written(path: Path) -> bool:
-    """Whether the file is marked as being written: a program writes it, or died while writing."""
+    """True if the file is marked as being written: a program writes it, or died while writing."""
     head = superblock(path)
     return head is not None and head.open_for_writing
 

@@ -92,7 +92,7 @@ def axes_of(
 
 
 def _is_numpy(path: Path) -> bool:
-    """Whether it is a NumPy file by its first bytes, whatever its name."""
+    """True if it is a NumPy file by its first bytes, whatever its name."""
     with path.open("rb") as file:
         return file.read(6).startswith((b"PK", b"\x93NUMPY"))
 

@@ -116,7 +116,7 @@ class WriterLock:
     """A lock held until `release`, or until this process ends. There is no lock if the file system has none.
 
     Args:
-        exclusive: take an exclusive lock, and raise OSError where another process holds one; else a shared one.
+        exclusive: take an exclusive lock, and raise OSError if another process holds one; else a shared one.
     """
 
     def __init__(self, path: Path, *, exclusive: bool = False) -> None:
@@ -137,7 +137,7 @@ class WriterLock:
 
 
 def held(path: Path, *, exclusively: bool = False) -> bool | None:
-    """Whether a running program has the file open, as far as locks tell; False if the file cannot be opened, None if
+    """True if a running program has the file open, as far as locks tell; False if the file cannot be opened, None if
     its file system has no locks.
 
     Args:
@@ -161,7 +161,7 @@ def held(path: Path, *, exclusively: bool = False) -> bool | None:
 
 
 def abandoned(path: Path) -> bool:
-    """Whether no program seems to write the file: it has not changed for QUIET s, and no running program has it
+    """True if no program seems to write the file: it has not changed for QUIET s, and no running program has it
     open."""
     return time.time() - path.stat().st_mtime > QUIET and not held(path)
 
@@ -172,8 +172,8 @@ class WriterWatch:
 
     Args:
         now: s, by the clock of the follower.
-        patience: s without a frame, after which a file without a lock counts as one whose writer died. With the lock
-            the writer waits: for the operator, the beam, or a long exposure.
+        patience: s without a frame, after which a file without a lock counts as one whose process was killed. With the
+            lock the writer waits: for the operator, the beam, or a long exposure.
     """
 
     def __init__(self, path: Path, now: float, patience: float = PATIENCE) -> None:

@@ -40,7 +40,7 @@ _LOADERS = (
 
 
 def of_library(name: str, problem: OSError) -> tuple[str, str]:
-    """Why a library is not loaded, and what to do; both empty where it is not there."""
+    """Why a library is not loaded, and what to do; both empty if it is not there."""
     for said, what, advice in _LOADERS if Path(name).is_absolute() and Path(name).exists() else ():
         if match := re.search(said, str(problem).replace(name, "itself"), re.IGNORECASE):
             return what.format(*filter(None, match.groups())), advice.format(*filter(None, match.groups()))

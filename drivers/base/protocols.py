@@ -66,7 +66,7 @@ class DigitalOutput(Protocol):
         """Set the line to high or low. Raises DeviceError if the controller refuses or fails."""
 
     def get(self) -> bool | None:
-        """Whether the line is high; None if the controller cannot read it back."""
+        """True if the line is high; None if the controller cannot read it back."""
 
 
 class RotationStage(Protocol):

@@ -193,6 +193,6 @@ def _target(properties: Properties) -> str:
 
 
 def _steady(history: list[tuple[float, float]]) -> bool:
-    """Whether the temperatures cover STEADY_FOR s and stay within STEADY_BAND °C."""
+    """True if the temperatures cover STEADY_FOR s and stay within STEADY_BAND °C."""
     values = [value for _, value in history]
     return history[-1][0] - history[0][0] >= STEADY_FOR and max(values) - min(values) <= STEADY_BAND

@@ -36,7 +36,7 @@ class PvValue:
         return self.label or f"{self.value}"
 
     def is_one(self, wanted: float | str) -> bool:
-        """Whether the value equals this number, text or label."""
+        """True if the value equals this number, text or label."""
         return wanted in (self.value, self.label) if self.label else self.value == wanted
 
 

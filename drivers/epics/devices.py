@@ -98,7 +98,7 @@ class PvShutter(_PvDevice):
         self._put(self._closer, self._pvs.close_value, False, lambda: None)
 
     def is_open(self) -> bool:
-        """Whether the status is open. Raises DeviceTimeout without an answer, DeviceError if the alarm is INVALID."""
+        """True if the status is open. Raises DeviceTimeout without an answer, DeviceError if the alarm is INVALID."""
         (status,) = self._status.read("")
         refuse_invalid(self.name, self._status.name, status, NOT_KNOWN)
         return status.is_one(self._pvs.status_open)

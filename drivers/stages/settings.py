@@ -133,7 +133,7 @@ class StageSettings(Protocol):
 
     @property
     def pulse_output(self) -> int | None:
-        """Number of the digital output that the trigger pulses come from; None where no output can be set."""
+        """Number of the digital output that the trigger pulses come from; None if no output can be set."""
 
     def limits(self) -> StageLimits:
         """The stage's limits, as far as they are known before it is connected."""

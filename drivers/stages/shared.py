@@ -83,7 +83,7 @@ class Stops:
 
     @property
     def came_since(self) -> bool:
-        """Whether a stop came since the last move began."""
+        """True if a stop came since the last move began."""
         return self.count != self._before
 
     def came(self, *, hard: bool) -> None:

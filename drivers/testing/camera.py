@@ -1,6 +1,6 @@
 """Conformance tests for every camera, real or simulated; the tests of a camera subclass them.
 
-A subclass gives `bench`, a fixture that makes a CameraBench anew for each test. Frames are small and exposures
+A subclass gives `bench`, a fixture that makes a CameraBench again for each test. Frames are small and exposures
 short.
 """
 

@@ -180,7 +180,7 @@ class Label:
 
 
 def within(views: Views | None, shot: Shot) -> bool:
-    """Whether the shot lies in the range; True without a range."""
+    """True if the shot lies in the range; True without a range."""
     return views is None or views[0] <= shot.view < views[1]
 
 

@@ -85,5 +85,5 @@ class Beam:
 
     @property
     def has_energy(self) -> bool:
-        """Whether it states its energies, as materials need."""
+        """True if it states its energies, as materials need."""
         return any(light is not None for light in (self.energy_kev, self.spectrum, self.tube))

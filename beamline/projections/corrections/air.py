@@ -33,7 +33,7 @@ _VOXELS, _VIEWS = 2**20, 180  # upper limits for the volume that shows where the
 _RIMS = 6.0, 1.5
 _COPIES = 6  # float32 copies of the volume
 _TERMS, _SUMS = 40, 800  # float64 numbers per binned pixel, and per projection
-_AT_ONCE, _NOISE_VIEWS = 64, 16  # views
+_AT_ONCE, _NOISE_VIEWS = 64, 16  # projections
 _LEAST_VIEWS, _WIDEST_GAP = 12, np.radians(30)
 
 Columns = Literal["none", "auto"] | tuple[int, int]
@@ -126,7 +126,7 @@ class Air:
 
 
 def background_memory(geometry: Geometry) -> int:
-    """Approximate peak memory of `without_background` in bytes, without the views themselves."""
+    """Approximate peak memory of `without_background` in bytes, without the projections themselves."""
     from recon.voxels.fbp import fbp_memory
 
     small = geometry.binned(factor_within(geometry.detector_shape, _VOXELS))

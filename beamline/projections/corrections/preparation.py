@@ -94,7 +94,7 @@ class Preparation:
 
     @property
     def judged(self) -> bool:
-        """Whether the monitor checks the frames first."""
+        """True if the monitor checks the frames first."""
         return self.flags == "judge"
 
     @property

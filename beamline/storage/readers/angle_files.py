@@ -145,7 +145,7 @@ def select_rows(angles: NDArray[np.float64], rows: str) -> NDArray[np.float64]:
 def assign(
     source: ScanSource, angles: NDArray[np.float64], name: str, *, of_views: bool = False
 ) -> NDArray[np.float64]:
-    """Assign an angle in radians to each frame of a source, NaN where unknown.
+    """Assign an angle in radians to each frame of a source, NaN if unknown.
 
     There is one angle for each projection; or one for each number of a series of files, where some are lost; or one for
     each frame, where the order of all frames is known. A log that holds nan for each dark and flat tells it, too. A log
@@ -178,12 +178,12 @@ def assign(
 
 
 def _count_all(numbers: NDArray[np.int64], n: int) -> bool:
-    """Whether the numbers of files, no two of them the same, go from the first to the last of n."""
+    """True if the numbers of files, no two of them the same, go from the first to the last of n."""
     return bool(numbers.min() >= 0 and np.ptp(numbers) + 1 == n and np.unique(numbers).size == numbers.size)
 
 
 def _in_equal_steps(angles: NDArray[np.float64]) -> bool:
-    """Whether no step is half as long again, or half as short, as the typical one."""
+    """True if no step is half as long again, or half as short, as the typical one."""
     steps = np.diff(angles)
     typical = float(np.median(steps))
     return bool((np.abs(steps - typical) < abs(typical) / 2).all())
@@ -254,7 +254,7 @@ def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int]
     """First and last row of the n consecutive rows with the most equal steps; None if the choice is ambiguous.
 
     A scan's angle log often holds the darks and flats as well, at a standing stage. If the steps go on beyond these
-    rows, other rows would do as well: then views were lost, and nothing tells which.
+    rows, other rows would do as well: then projections were lost, and nothing tells which.
     """
     if n < 3 or angles.size <= n or not np.isfinite(angles).all():
         return None

@@ -62,14 +62,14 @@ class ScanSource(ABC):
         central_ray: (row, column) that it meets, by the file, which is shown and not used; NaN: not stated.
         unreadable: rows that `read_known` was asked for and the file does not give, and why.
         row_pitch_mm: height of a pixel, as `pixel_size_mm`, where it differs from the width; None: pixels are square.
-        in_order: the frames are in the order of acquisition. False: darks and flats stand before the views, whenever
-            they were taken.
+        in_order: the frames are in the order of acquisition. False: darks and flats stand before the projections,
+            whenever they were taken.
         untyped: the file does not say whether the bits of pixels are those of whole or of real numbers.
-        pixel_mask: bool [row, col], pixels that the file says not to use; None where it says nothing.
+        pixel_mask: bool [row, col], pixels that the file says not to use; None if it says nothing.
         frames_per_view: of the camera, that a projection is the mean of; 1: it is one.
         not_used: what the file states of geometry, units, order and validity, and what is not used.
         unpack_bytes: bytes of memory that are taken while a frame's part of a compressed file is unpacked.
-        plan: the requested scan, as our files record it; empty if unknown.
+        plan: the requested scan, as this program's files record it; empty if unknown.
         row_period: s from the exposure of a row to that of the next; 0: all together, None: unknown.
         decisions: what was chosen after passes, oldest first: values of the event `next_chosen`.
         stated_ending: `ending` of a format in which it does not change.
@@ -113,7 +113,7 @@ class ScanSource(ABC):
 
     @property
     def finished(self) -> bool:
-        """Whether no more frames will come. Check before refresh(): refresh() then finds all frames."""
+        """True if no more frames will come. Check before refresh(): refresh() then finds all frames."""
         return True
 
     @property
@@ -128,7 +128,7 @@ class ScanSource(ABC):
 
     @property
     def checksummed(self) -> bool:
-        """Whether the file has a checksum for every frame."""
+        """True if the file has a checksum for every frame."""
         return False
 
     @property
@@ -226,7 +226,7 @@ class Opening:
         follow: the file may still be growing.
         own_angles: the file's angles are used; False: the caller brings them, so the file may lack them.
         one_series: the caller says the kind of each frame; names of files say none.
-        counts: the caller says that pixels are counts, and gives no references: they may lie beside the views.
+        counts: the caller says that pixels are counts, and gives no references: they may lie beside the projections.
     """
 
     follow: bool = False

@@ -115,11 +115,11 @@ class ExchangeSource(StacksSource):
         return len(self.table)
 
     def take_order(self, thetas: Mapping[FrameKind, NDArray[np.float64]], later: int | None) -> None:
-        """Sort darks and flats among the views, if the file says when flats were taken.
+        """Sort darks and flats among the projections, if the file says when flats were taken.
 
         Args:
             thetas: radians at which the darks and the flats were taken, where the file states them.
-            later: the first of the flats that were taken after the views; None: the acquisition does not say.
+            later: the first of the flats that were taken after the projections; None: the acquisition does not say.
         """
         table, place = self.table, np.full(len(self.table), -1.0)
         views = table.angles[table.views]
@@ -130,7 +130,8 @@ class ExchangeSource(StacksSource):
             at = np.abs(views - theta[:, None]).argmin(axis=1)
             place[table.of_kind(kind)] = np.where(at == views.size - 1, views.size, at - 0.5)  # those of the end
         turned = np.flatnonzero(np.diff(thetas.get(FrameKind.FLAT, np.zeros(1)))) + 1
-        if later is None and not in_turn and turned.size == 1:  # views in any order; flats at two places of the stage
+        # projections in any order; flats at two places of the stage
+        if later is None and not in_turn and turned.size == 1:
             later = int(turned[0])
         if later is not None:
             place[table.flats[later:]] = views.size
@@ -148,15 +149,15 @@ def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> dict[FrameKind, ND
 
 
 def _later_flats(file: h5py.File, n: int) -> int | None:
-    """The first of n flats that were taken after the views, where the acquisition says that it took them at both ends,
-    as many each time."""
+    """The first of n flats that were taken after the projections, where the acquisition says that it took them at both
+    ends, as many each time."""
     mode = datasets.dataset(file, f"{_FLATS}/flat_field_mode")
     each = datasets.scalar(file, f"{_FLATS}/num_flat_fields", _ANY) or n // 2
     return n // 2 if mode is not None and _words(mode).lower() == "both" and 2 * each == n > 0 else None
 
 
 def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
-    """Angles [frame] in radians, in the unit of the views if none is stated; None without a list of this length."""
+    """Angles [frame] in radians; default unit: that of the projections. None without a list of this length."""
     item = datasets.dataset(file, where)
     if item is None or item.size != n or item.dtype.kind not in "uif":
         return None
@@ -167,7 +168,7 @@ def _list(file: h5py.File, where: str, n: int) -> NDArray[np.float64] | None:
 
 
 def _set_exposures(table: FrameTable, file: h5py.File) -> None:
-    """Set exposures: one for all frames or for each view, and that of the flats if another one is stated."""
+    """Set exposures: one for all frames or for each projection, and that of the flats if another one is stated."""
     seconds = _seconds(file, f"{_DETECTOR}/exposure_time", table.views.size)
     if seconds is None:
         return
@@ -201,7 +202,7 @@ def _axes(item: h5py.Dataset) -> list[str]:
 
 
 def _order(item: h5py.Dataset) -> Order | None:
-    """Which dimensions are frames, rows and columns, by the attribute `axes`; None where that says nothing."""
+    """Which dimensions are frames, rows and columns, by the attribute `axes`; None if that says nothing."""
     return order_of_axes(_axes(item))
 
 

@@ -155,7 +155,7 @@ def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Pla
 
 
 def _is_default(places: Places) -> bool:
-    """Whether the NXdata that an entry's `default` names shows these frames."""
+    """True if the NXdata that an entry's `default` names shows these frames."""
     name = datasets.attribute(places.entry, "default")
     data = datasets.resolve(places.entry, name) if name else None
     if not isinstance(data, h5py.Group):
@@ -178,7 +178,7 @@ class NexusGeometry:
     Attributes:
         pixel_mm: (width, height) of a pixel: at the sample, of a cone on the detector.
         cone: mm from the source to the sample and to the detector; None also for a beam that is as good as parallel.
-        central_ray: (row, column) that it meets, counted as frames are read; NaN where it is not stated.
+        central_ray: (row, column) that it meets, counted as frames are read; NaN if it is not stated.
         mirrored: (rows, columns) of the frames are in reverse order.
         turned: turns of the detector that are not used, as text; "" for none.
         remarks: sentences by name, for `info`.

@@ -217,7 +217,7 @@ class NexusSource(ScanSource):
         return datasets.dataset(group, path)
 
     def _column(self, path: str) -> NDArray[np.int64] | None:
-        """Whole numbers [frame]; None where the file has no such list."""
+        """Whole numbers [frame]; None if the file has no such list."""
         item = self._item(self._places.entry, path)
         values = None if item is None else np.asarray(datasets.values_of(item))
         if values is None or values.ndim != 1 or values.size < self.n or values.dtype.kind not in "ui":
@@ -225,7 +225,7 @@ class NexusSource(ScanSource):
         return values[: self.n].astype(np.int64)
 
     def _seconds(self, group: h5py.Group, path: str) -> NDArray[np.float64]:
-        """Seconds of each frame; NaN where the file states none."""
+        """Seconds of each frame; NaN if the file states none."""
         values = datasets.in_units(self._item(group, path), datasets.TIME_UNITS)
         if values is None or 1 != values.size < self.n:
             return np.full(self.n, np.nan)

@@ -48,7 +48,7 @@ def no_data_of(source: ScanSource) -> Mask | None:
 
     Whole numbers alone have such marks: the largest of a type without a sign, and what is below 0 of the others. Types
     of 8 and 16 bits may end by too much light, so that whole rows and columns alone are marks there, and nothing else
-    may be at the end. None where nothing is marked, or more than half.
+    may be at the end. None if nothing is marked, or more than half.
     """
     if source.dtype.kind not in "iu":
         return None
@@ -67,7 +67,7 @@ def no_data_of(source: ScanSource) -> Mask | None:
 
 
 def _ends(source: ScanSource) -> list[Mask]:
-    """Pixels at the end of their type in sampled flats and views; [] if one of these frames has none."""
+    """Pixels at the end of their type in sampled flats and projections; [] if one of these frames has none."""
     ends = []
     for kind in (FrameKind.FLAT, FrameKind.PROJECTION):
         for row in spread(source.table.of_kind(kind), _LOOKED_AT):

@@ -68,7 +68,7 @@ class OwnScan(NexusSource):
 
     def _committed(self) -> int:
         """The frames that the writer of our file counts; where they are more than before, their pixels are read
-        anew."""
+        again."""
         committed = self._file[layout.COMMITTED]
         hdf5.look_again(committed)
         n = int(committed[()])

@@ -103,7 +103,7 @@ class SourceOptions:
         earlier: files of the same scan, which have ended; their frames come before those of `path`.
         horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
         frames: "darks=0:5,flats=5:10": of which kind frames are, by their rows; all others are projections. Names of
-            files in a folder then say no kinds. "0::2": every second view, as `transforms.selected` says.
+            files in a folder then say no kinds. "0::2": every second projection, as `transforms.selected` says.
         then: further files of the same scan, whose frames follow.
         side_file: of the scanner's maker: distances, pixel size, angles and white level, see `side_files`.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.
@@ -132,7 +132,7 @@ class SourceOptions:
 
     @property
     def stated(self) -> bool:
-        """Whether the caller says more of the scan than its path: then it is no volume."""
+        """True if the caller says more of the scan than its path: then it is no volume."""
         return any(getattr(self, field.name) is not field.default for field in fields(self)[1:])
 
     def open(self, *, follow: bool = False) -> ScanSource:
@@ -149,7 +149,7 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
 
     Raises:
         DataError: not there, not a format that we read, or not consistent; the message says what was found.
-        ConfigError: columns outside the detector; a number of frames a view that is less than 1.
+        ConfigError: columns outside the detector; a number of frames a projection that is less than 1.
         NotReadyError (a DataError, `follow` only): the file is not there yet or just being created; try again.
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
@@ -211,7 +211,7 @@ def _with_replacements(base: ScanSource, options: SourceOptions) -> ScanSource:
     )
     if angles is not None:
         of_each = n if views is None else views.step or 1
-        if angles.size * of_each == base.table.views.size:  # one for each view applies to its frames
+        if angles.size * of_each == base.table.views.size:  # one for each projection applies to its frames
             angles = np.repeat(angles, of_each)
         assigned = assign(base, angles, angles_from, of_views=options.angle_rows is not None)
         base = Frames(base, table=lambda known: replace(known, angles=assigned))

@@ -125,7 +125,7 @@ def order_by_shapes(
     """Which dimensions are frames, rows and columns, by the shapes of the references and the number of angles.
 
     MATLAB's first dimension is the last one here, and an image of its has rows before columns. Its stacks with the
-    views in the middle are sinograms, as ASTRA has them, with columns first.
+    projections in the middle are sinograms, as ASTRA has them, with columns first.
     """
     if len(views) != 3:
         lines = len(views) == 2 and any(shape[-1:] == views[-1:] and shape != views for shape in references)
@@ -145,15 +145,15 @@ def with_order(base: ScanSource, order: str | None, n_angles: int | None) -> Sca
     """A scan read from images whose dimensions, one image after the other, are those of `order`: "row,view,col".
 
     Args:
-        order: None: the images are views. But where there is one image, or images of one row or column, and another
-            dimension is as long as there are angles, they are a sinogram.
+        order: None: the images are projections. But where there is one image, or images of one row or column, and
+            another dimension is as long as there are angles, they are a sinogram.
 
     Raises:
         DataError: some of the images are darks or flats, or they have other dimensions; or a sinogram is square.
     """
     sizes, alike = (len(base.table), *base.shape), base.table.are_views.all()
     fits = [axis for axis, n in enumerate(sizes) if n == n_angles]
-    counted = base.table.numbers is not None and sizes[0] > 1  # images that are files of a series are views
+    counted = base.table.numbers is not None and sizes[0] > 1  # images that are files of a series are projections
     if order is None and (1 not in sizes or n_angles in (1, sizes[0]) or not fits or not alike or counted):
         return base
     if order is None and len(fits) > 1:

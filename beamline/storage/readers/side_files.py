@@ -131,7 +131,7 @@ class SideFile:
 
 
 def with_side_file(base: ScanSource, side: SideFile) -> ScanSource:
-    """A scan with the distances and the pixel size of a vendor's file; DataError where that has another number of
+    """A scan with the distances and the pixel size of a vendor's file; DataError if that has another number of
     projections.
     """
     views = base.table.views.size
@@ -178,7 +178,7 @@ def side_of(source: ScanSource) -> SideFile | None:
 
 
 def reconstructed_pixel_mm(log: Path) -> float | None:
-    """Edge of a voxel in mm by the log that NRecon writes beside its slices; None where it states none."""
+    """Edge of a voxel in mm by the log that NRecon writes beside its slices; None if it states none."""
     with suppress(Exception):  # whatever the log of another program holds
         edge = float(with_points([_values(log)["reconstruction/pixel size (um)"]])[0]) * 1e-3
         return edge if 0 < edge < _LARGEST else None
@@ -272,7 +272,7 @@ def _side_file(path: Path, keys: MakerKeys, values: Mapping[str, str]) -> SideFi
 
 
 def _degrees(path: Path, keys: MakerKeys, number: Mapping[str, float | None], n: int) -> NDArray[np.float64] | None:
-    """Degrees of each projection: as listed beside the file, or in equal steps; None where nothing is stated."""
+    """Degrees of each projection: as listed beside the file, or in equal steps; None if nothing is stated."""
     if keys.maker == "Nikon" and (listed := _listed_angles(path, n)) is not None:
         return listed
     step, span = number["step"], number["span"] or _ROUND.get(keys.maker)

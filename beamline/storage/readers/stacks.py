@@ -139,7 +139,8 @@ def open_stacks(
     Args:
         data: of the projections, None: the only array of images. Their dimensions may follow it, as in
             `/images:view,col,row`, and those of darks and flats are in the same order.
-        angles: of the angles of the projections alone, whose number helps to tell which dimension is that of the views.
+        angles: of the angles of the projections alone, whose number helps to tell which dimension is that of the
+            projections.
 
     Raises:
         DataError: one is not there, or is no stack of frames; the message names the datasets that the file has.
@@ -169,7 +170,7 @@ def open_stacks(
 
 
 def _take_angles(source: StacksSource, lists: list[NamedArray]) -> None:
-    """Take the one list that is named so, in the unit that it states, or in which it goes round half a turn or one."""
+    """Take the one list that is named so, in the unit that it states, or in which it goes round 180 degrees or one."""
     if len(lists) != 1:
         return
     item, values, turns = lists[0], np.unique(lists[0][...]), {"rad": 2 * np.pi, "deg": 360.0}
@@ -186,7 +187,8 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
     """Take the geometry that CIL states beside `views`, the dataset of the projections; lengths in mm.
 
     CIL turns the object by its angles counter-clockwise about the axis, which is the beam turned by their negative (its
-    `convert_geometry_to_astra_vec_3D`). Here the view turns by θ in the frame of the detector: columns, beam, rows.
+    `convert_geometry_to_astra_vec_3D`). Here the projection turns by θ in the frame of the detector: columns, beam,
+    rows.
     """
     config = datasets.resolve(views.parent.parent, "config") if isinstance(views, h5py.Dataset) else None
     if not isinstance(config, h5py.Group) or "pixel_size_h" not in views.attrs:
@@ -211,7 +213,7 @@ def _take_geometry(source: StacksSource, views: Any) -> None:
 
 
 def in_frame_of_detector(item: Any, angles: F64, unit: str | None) -> F64:
-    """Radians of views in the frame of their detector, from those of CIL's object; others as they are.
+    """Radians of projections in the frame of their detector, from those of CIL's object; others as they are.
 
     Args:
         angles: the values of `item` in radians.

@@ -55,7 +55,7 @@ class Complaints(logging.Handler):
 
 
 def is_hidden(name: str) -> bool:
-    """Whether a file is a system's companion of another, such as a Mac's `._0001.tif`, and no image."""
+    """True if a file is a system's companion of another, such as a Mac's `._0001.tif`, and no image."""
     return name.rpartition("/")[2].startswith(".")
 
 
@@ -83,7 +83,7 @@ def orientation(tif: tifffile.TiffFile) -> int:
 
 
 def is_untyped(tif: tifffile.TiffFile) -> bool:
-    """Whether a TIFF does not say of what type its pixels are: no SampleFormat (tag 339), or 4, undefined."""
+    """True if a TIFF does not say of what type its pixels are: no SampleFormat (tag 339), or 4, undefined."""
     tag = images_of(tif)[0].keyframe.tags.get(339)
     return tag is None or int(np.ravel(tag.value)[0]) not in (1, 2, 3)
 
@@ -99,7 +99,8 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
     """The images of a TIFF that are not used: copies, and those of other files.
 
     Raises:
-        DataError: its OME metadata say that pages go along several axes, which of them the views are is not known.
+        DataError: its OME metadata say that pages go along several axes, which of them the projections are is not
+            known.
     """
     listed, why = 0, "the full-resolution images of this file are used as frames"
     for pixels in re.findall(r"<Pixels\b[^>]*>", tif.pages.first.description):
@@ -145,7 +146,7 @@ FOREIGN = ".jpg", ".jpeg", ".bmp", ".gif", ".jp2"  # pictures that are not read:
 
 
 def images_among(names: Sequence[str]) -> list[str]:
-    """The images among files, of the first kind that there is: other kinds beside it are no frames of the scan."""
+    """The images among files, of the first kind that there is: other kinds next to it are no frames of the scan."""
     kinds = (SUFFIXES, (".npy",), (".png",))
     by_kind = ([name for name in names if name.lower().endswith(kind) and not is_hidden(name)] for kind in kinds)
     return next(filter(None, by_kind), [])

@@ -104,9 +104,9 @@ def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
     """A scan whose kinds of frames are assigned by the caller, or which has only the frames of one energy.
 
     Args:
-        kinds: such as "darks=0:5,flats=5:10+95:100,views=10:95", rows of the scan, ends not included. Without views
-            all other frames are projections, else invalid. "none=30:38" alone makes these invalid, and others stay.
-            "energy=20" makes frames of other energies invalid, by the file.
+        kinds: such as "darks=0:5,flats=5:10+95:100,views=10:95", rows of the scan, ends not included. Without
+            projections all other frames are projections, else invalid. "none=30:38" alone makes these invalid, and
+            others stay. "energy=20" makes frames of other energies invalid, by the file.
 
     Raises:
         DataError: they are no such text, lie outside the scan, or the file states no such energy.
@@ -124,7 +124,7 @@ def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
 
 
 def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
-    """The kinds and the views that --frames names, as "darks=0:5,flats=5:10,0::2" does; None: it names none."""
+    """The kinds and the projections that --frames names, as "darks=0:5,flats=5:10,0::2" does; None: it names none."""
     words = [] if frames is None else frames.split(",")
     matches = [_VIEWS.fullmatch(word) for word in words]
     taken = [slice(*(int(number) if number else None for number in match.groups())) for match in matches if match]
@@ -134,13 +134,13 @@ def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
 
 
 def selected(base: ScanSource, views: slice) -> ScanSource:
-    """Some views of a scan, counted from 0 without darks and flats; the others are invalid frames.
+    """Some projections of a scan, counted from 0 without darks and flats; the others are invalid frames.
 
-    Where the number of darks (flats) is a multiple of the step, they were taken in turn as the views were, so that
-    those of the same turn are selected, counted from 0, too. Else all of them are.
+    Where the number of darks (flats) is a multiple of the step, they were taken in turn as the projections were, so
+    that those of the same turn are selected, counted from 0, too. Else all of them are.
 
     Raises:
-        DataError: no view is left.
+        DataError: no projection is left.
     """
     table, n, out = base.table, base.table.views.size, list[NDArray[np.int64]]()
     first, end, step = views.indices(n)
@@ -156,7 +156,7 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
 
 
 def only_left_out(kinds: str | None) -> bool:
-    """Whether the caller says of no frame which kind it has, but of some that they are left out."""
+    """True if the caller says of no frame which kind it has, but of some that they are left out."""
     return kinds is not None and all(word.strip().startswith(("none=", _ENERGY)) for word in kinds.split(","))
 
 
@@ -250,7 +250,7 @@ def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def real_type(images: NDArray[Any]) -> np.dtype[Any] | None:
-    """The real type of whole numbers [..., col] that are the bits of real ones; None where they are whole.
+    """The real type of whole numbers [..., col] that are the bits of real ones; None if they are whole.
 
     Real numbers of one quantity lie close together by their bits. Whole numbers would do so only if nearly all of them
     lay within four per cent of the range of their type, around a quarter or three quarters of it.
@@ -279,7 +279,7 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
     Images are smooth: where counts pass the end of the signed type, neighbours differ by all of its range, and read
     without a sign they do not. Counts that are all beyond the end are negative, which no light is. What is negative by
     noise around 0, or marks pixels without data by one value, has not wrapped. Four bytes may hold those of two, where
-    a file has views as int16 beside flats as uint16.
+    a file has projections as int16 beside flats as uint16.
     """
     if images.dtype.kind != "i" or images.dtype.itemsize > 4 or images.shape[-1] < 2:
         return None

@@ -13,15 +13,15 @@ from recon.base.units import gone_round, look_like_degrees
 from recon.voxels.view_weights import angular_weights
 
 FARTHEST = 1e6  # degrees
-_GAP = 0.5  # degrees without a view beyond the others, of views in even steps
-_UNWEIGHED = 9.0  # degrees that no view's weight covers: FBP loses a twentieth of the density
-_SAME = 0.1  # of the mean step: views so close are one
-_EQUAL, _FEW = 1e-3, 4  # degrees between views of one direction; columns of the detector to a direction
-_FALSE_ALARM = 1e-3  # of scans whose views are at random
+_GAP = 0.5  # degrees without a projection beyond the others, of projections in even steps
+_UNWEIGHED = 9.0  # degrees that no projection's weight covers: FBP loses a twentieth of the density
+_SAME = 0.1  # of the mean step: projections so close are one
+_EQUAL, _FEW = 1e-3, 4  # degrees between projections of one direction; columns of the detector to a direction
+_FALSE_ALARM = 1e-3  # of scans whose projections are at random
 _OF_MEAN = 0.8  # standard deviation of gaps at random, without the largest, over their mean
 _COUNTED = " The values are 0, 1, 2 and so on: are they frame numbers?"
 _LISTED = 20  # groups of frames in a sentence
-_MANY = 30  # views: fewer within 6.28 degrees may be a trial scan, and are not refused as radians
+_MANY = 30  # projections: fewer within 6.28 degrees may be a trial scan, and are not refused as radians
 
 
 def angles_unknown(scan: ScanEvidence) -> str:
@@ -38,7 +38,7 @@ def angles_unknown(scan: ScanEvidence) -> str:
 
 
 def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
-    """The projections have different directions, over half a turn, and their angles may be in degrees."""
+    """The projections have different directions, over 180 degrees, and their angles may be in degrees."""
     angles = scan.table.angles[scan.table.views]
     if angles.size < 2 or not np.isfinite(angles).all():
         return
@@ -62,7 +62,7 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
         return
     step = span / (distinct.size - 1)
     if (text := _no_degrees(angles, distinct)) is not None:
-        # A plan is of our own scans, whose angles are in degrees.
+        # A plan is of this program's own scans, whose angles are in degrees.
         yield Finding("warning" if scan.source.plan else "error", "angle-spread", text)
     elif (unseen := half_turn_unseen(angles)) > 0:
         span_text = f"span {span:.2f} degrees, less than 180" if span + step < 180 else "do not cover 180 degrees"
@@ -84,24 +84,25 @@ def angles_spread(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def directions(angles: NDArray[np.float64]) -> int:
-    """The directions of rays that parallel views [view], in rad, see: half a turn later they are the same."""
+    """The directions of rays that parallel projections [view], in rad, see: 180 degrees later they are the same."""
     half = np.mod(np.degrees(angles), 180.0)
     return int(np.unique(np.round(np.where(half > 180.0 - _EQUAL, 0.0, half) / _EQUAL)).size)
 
 
 def half_turn_unseen(angles: NDArray[np.float64]) -> float:
-    """Degrees of half a turn without a view, beyond the spacing of the views [view] in rad: the largest gap, or all.
+    """Degrees of 180 degrees without a projection, beyond the spacing of the projections [view] in rad: the largest
+    gap, or all.
 
-    All gaps count in which `angular_weights` take views for missing, if these are a twentieth of half a turn.
+    All gaps count in which `angular_weights` take projections for missing, if these are a twentieth of 180 degrees.
 
-    Views half a turn apart see the same rays. Of views at random, the largest gap exceeds the next by an exponentially
-    distributed length, whose mean is that of all gaps (Rényi 1953). Two scans of 45 or more such views in a thousand,
-    and one of ten views in a hundred, exceed what is allowed for. Views in even steps have gaps alike, and half a
-    degree more is named.
+    Projections 180 degrees apart see the same rays. Of projections at random, the largest gap exceeds the next by an
+    exponentially distributed length, whose mean is that of all gaps (Rényi 1953). Two scans of 45 or more such
+    projections in a thousand, and one of ten projections in a hundred, exceed what is allowed for. Projections in even
+    steps have gaps alike, and half a degree more is named.
     """
     places = np.sort(np.mod(np.degrees(angles), 180.0))
     gaps = np.diff(places, append=places[0] + 180.0)
-    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # views side by side are one
+    gaps = gaps[gaps > _SAME * 180.0 / places.size]  # projections side by side are one
     if gaps.size < 2:
         return 180.0
     *others, second, largest = np.sort(gaps)
@@ -110,13 +111,13 @@ def half_turn_unseen(angles: NDArray[np.float64]) -> float:
     times = n * (_FALSE_ALARM ** (-1 / n) - 1)  # 6.9 of a mean that is known; more where it is estimated from n gaps
     limit = second + max(_GAP, times * uneven)
     if not np.isclose(largest, 180.0 - np.ptp(np.degrees(angles)), atol=_GAP):
-        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the views: one that was lost is no wedge
+        limit = max(limit, 2 * float(np.median(gaps)) + _GAP)  # within the projections: one that was lost is no wedge
     unweighed = 180.0 - float(np.degrees(angular_weights(angles).sum()))
     return max(float(largest) if largest > limit else 0.0, unweighed if unweighed > _UNWEIGHED else 0.0)
 
 
 def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> str | None:
-    """What shows that angles [view], in rad as they were read, were not in degrees; None where they may have been.
+    """What shows that angles [view], in rad as they were read, were not in degrees; None if they may have been.
 
     Args:
         distinct: the same in degrees, each once and ascending.
@@ -144,7 +145,7 @@ def _no_degrees(angles: NDArray[np.float64], distinct: NDArray[np.float64]) -> s
 
 
 def _smaller_unit(degrees: NDArray[np.float64], n: int) -> str | None:
-    """What n angles under a label of degrees, distinct and ascending, are instead; None where they may be degrees."""
+    """What n angles under a label of degrees, distinct and ascending, are instead; None if they may be degrees."""
     if part := gone_round(degrees, 2 * np.pi):
         return f"these look like radians: {'180 degrees are' if part < 4 else '360 degrees are'} {part:.5g}."
     return "these look like radians or turns." if n > _MANY and np.ptp(degrees) <= 2 * np.pi else None

@@ -23,19 +23,19 @@ from recon.base.noise import deviation_between_frames
 from recon.base.views import spread
 
 VIEWS = 8  # that are looked at
-AT_THE_ENDS = 1e-3  # share of a view's pixels that its least and its largest number may have, where it was scaled
+AT_THE_ENDS = 1e-3  # share of a projection's pixels that its least and its largest number may have, where it was scaled
 ALIKE = 6  # pixels, at most, that had one count by chance before they were scaled
 SPREAD = 16  # grey values between them, at least, where they are whole numbers
-WARN = 0.45  # line integral of air: the beam of Diamond 24737 lost 0.39 from its flat to its views, others 0.02
+WARN = 0.45  # line integral of air: the beam of Diamond 24737 lost 0.39 from its flat to its projections, others 0.02
 REFUSE = 0.65  # half of the light, which goes by no drift, decay or top-up; see ReferenceLimits.light_gone
-BRIGHTER = 0.2  # line integral by which a ring that is filled again makes views brighter than their flats
-NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sample adds to the noise of views
+BRIGHTER = 0.2  # line integral by which a ring that is filled again makes projections brighter than their flats
+NOISIER = 1.5  # times; 67 random scans have 0.3 to 0.98, as structure of the sample adds to the noise of projections
 ROWS, LEAST_FLATS = 128, 3  # whose noise is looked at
 TILE, QUIET = 8, 20.0  # pixels a side, whose variance is known to a fifth; percentile of the tiles
 BELOW, OF_VIEWS = (
     0.005,
     0.25,
-)  # shares of the lit places and of the views that lie below the darks: no spots, no lost rows
+)  # shares of the lit places and of the projections that lie below the darks: no spots, no lost rows
 MORE_LIGHT, HIGHER = 0.1, 0.01  # of flats and darks, shares of the light: examples of what they do where no air is
 """Limits, each with its reason."""
 
@@ -93,11 +93,11 @@ def views_scaled(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool = False) -> Iterator[Finding]:
-    """The air of views is as bright as their flats, apart from the usual drift of a beam during a scan.
+    """The air of projections is as bright as their flats, apart from the usual drift of a beam during a scan.
 
     Args:
-        level: line integral of the air, the median of the views; without air, of the place that absorbs least.
-        air: columns of air were found, whose light was taken off.
+        level: line integral of the air, the median of the projections; without air, of the place that absorbs least.
+        air: columns of air were found, whose light was subtracted.
         accepted: a fault is a warning.
     """
     darker = level > WARN and air
@@ -136,7 +136,7 @@ def check_air_level(scan: ScanEvidence, level: float, air: bool, accepted: bool 
 
 
 def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
-    """Darks are images, nowhere brighter than the views, and air is not saturated."""
+    """Darks are images, nowhere brighter than the projections, and air is not saturated."""
     if scan.beam is None:
         return
     dark, flat = np.min(scan.cells(np.concatenate(scan.used.darks)), axis=0), scan.beam[1]  # zingers light single darks
@@ -170,7 +170,7 @@ def darks_beside_views(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def _counts_in_words(scan: ScanEvidence) -> str:
-    """Sentences on counts and exposures of flats and views, where views are brightest."""
+    """Sentences on counts and exposures of flats and projections, where projections are brightest."""
     views = spread(scan.table.views, VIEWS)
     darks, flats = (np.concatenate(groups) for groups in scan.used)
     seen, flat, dark = (scan.mean_cells(rows) for rows in (views, flats, darks))
@@ -182,7 +182,7 @@ def _counts_in_words(scan: ScanEvidence) -> str:
 
 
 def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
-    """A sentence on the exposures that the file states of some flats and views."""
+    """A sentence on the exposures that the file states of some flats and projections."""
     exposed = [scan.table.exposures[some] for some in rows]
     if all(np.isfinite(each).all() for each in exposed):
         said = [f"{np.median(each):g} s" for each in exposed]
@@ -191,10 +191,11 @@ def _exposures_in_words(scan: ScanEvidence, *rows: NDArray[np.int64]) -> str:
 
 
 def without_air(scan: ScanEvidence, mean: float) -> str:
-    """Sentences on what wrong flats and darks do to line integrals (their mean) of views in which no column is air.
+    """Sentences on what wrong flats and darks do to line integrals (their mean) of projections in which no column is
+    air.
 
-    A factor of the light is one constant in every line integral, and may be matter beyond the field as well. Of cans of
-    1.5 to 3 times the field, the densities of FBP rise by 0.4 to 0.8 of the share, those of FISTA-TV by 0.9.
+    A factor of the light is one constant in every line integral, and may be material beyond the field as well. Of cans
+    of 1.5 to 3 times the field, the densities of FBP rise by 0.4 to 0.8 of the share, those of FISTA-TV by 0.9.
     """
     flats, views = scan.table.flats, scan.table.views
     more = math.log1p(MORE_LIGHT)
@@ -208,10 +209,10 @@ def without_air(scan: ScanEvidence, mean: float) -> str:
 
 
 def _noise_ratio(scan: ScanEvidence) -> float:
-    """Variance over light of the flats, over that of the views; 0 where it is not known.
+    """Variance over light of the flats, over that of the projections; 0 where it is not known.
 
     Photon transfer (Janesick 2007): light brings its variance, by one factor for all images of a camera. Structure of
-    the sample adds to the variance of views, so that their quietest places count.
+    the sample adds to the variance of projections, so that their quietest places count.
     """
     views = spread(scan.table.views, VIEWS)
     taken = [np.concatenate(scan.used.darks), spread(max(scan.used.flats, key=len), VIEWS), views]
@@ -230,7 +231,7 @@ def _noise_ratio(scan: ScanEvidence) -> float:
 
 
 def _gain(net: F32, light: F32) -> float:
-    """Variance of counts over their number, in the quietest tiles of an image; NaN where there is none."""
+    """Variance of counts over their number, in the quietest tiles of an image; NaN if there is none."""
     with np.errstate(divide="ignore", invalid="ignore"):
         change = np.diff(np.diff(net / light, axis=0), axis=1)
         each = np.where(net > 0, light**2 / net, np.nan)[1:, 1:] * change**2 / 4
@@ -274,12 +275,13 @@ def exposures_agree(scan: ScanEvidence) -> Iterator[Finding]:
         )
 
 
-_IN_A_ROW, _BESIDE = 12, np.radians(20.0)  # views looked at; between them: a wide sample differs from farther sides
+# projections looked at; between them: a wide sample differs from farther sides
+_IN_A_ROW, _BESIDE = 12, np.radians(20.0)
 _AS_GOOD = 0.8  # of the light of the best step, beside its flats: a sample takes as much of others
 
 
 def light_one(scan: ScanEvidence) -> Iterator[Finding]:
-    """Views in a row have one light, but for a drift; else which step takes one, with its flats."""
+    """Projections in a row have one light, except for a drift; else which step takes one, with its flats."""
     flats, views = scan.table.flats, scan.table.views
     ends = views[:_IN_A_ROW], views[-_IN_A_ROW:]
     if (
@@ -304,7 +306,7 @@ def light_one(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def _way_of_steps(scan: ScanEvidence, n: int, most: float) -> str:
-    """Which step through the views takes one of so many lights, with its flats."""
+    """Which step through the projections takes one of so many lights, with its flats."""
     shares = np.array([_share_of_flats(scan, slice(first, None, n), most) for first in range(n)])
     steps = [f"--frames {first}::{n}" for first in range(n) if 0 < shares[first] >= _AS_GOOD * shares.max()]
     if not steps:
@@ -324,7 +326,7 @@ def _light_levels(scan: ScanEvidence, rows: I64) -> F64:
 
 
 def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
-    """Light of the views of a step over that of its flats; 0 where its flats differ, or are darker."""
+    """Light of the projections of a step over that of its flats; 0 where its flats differ, or are darker."""
     table = selected(scan.source, step).table
     flats, views = (_light_levels(scan, rows[:_IN_A_ROW]) for rows in (table.flats, table.views))
     share = math.exp(np.median(views) - np.median(flats))
@@ -332,7 +334,7 @@ def _share_of_flats(scan: ScanEvidence, step: slice, most: float) -> float:
 
 
 def several_energies(scan: ScanEvidence) -> str:
-    """The energies at which views were taken, of which a volume requires one."""
+    """The energies at which projections were taken, of which a volume requires one."""
     energies = np.zeros(0) if scan.table.energies is None else scan.table.energies[scan.table.views]
     return "" if len(parts := frames_by_energy(energies)) < 2 else (
         f"The projections were taken at {len(parts)} energies: {in_words(energies)}. A volume needs one "

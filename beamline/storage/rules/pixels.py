@@ -23,7 +23,7 @@ from recon.base.views import spread
 CONSTANT_DARKS = "constant-darks"  # a rule whose finding is no fault, but which `info` shows
 _SURELY_BELOW, _FEW = 0.1, 0.005  # of the range below 0, and of the pixels: no noise of a signed number, nor spots
 _SAMPLES = 4  # frames of a kind that are looked at
-SHAPES = 32  # views whose shape is looked at
+SHAPES = 32  # projections whose shape is looked at
 _FALLS = (
     "Give --quantity transmission, which takes the logarithm: the values are about 1 at the edges of the "
     "projections and lower in the sample, like transmission. Line integrals would be 0 at the edges and "
@@ -114,13 +114,13 @@ def pixels_measured(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def _falls(scan: ScanEvidence) -> bool:
-    """The views look like transmission, which real numbers can be."""
+    """The projections look like transmission, which real numbers can be."""
     views = sample(scan, FrameKind.PROJECTION, SHAPES) if scan.source.dtype.kind == "f" else None
     return views is not None and look_like_transmission(views)
 
 
 def sample(scan: ScanEvidence, kind: FrameKind, count: int = _SAMPLES) -> NDArray[Any] | None:
-    """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None where there is none."""
+    """A few frames of a kind, spread over the scan, at most 256 rows of the middle; None if there is none."""
     rows = scan.table.of_kind(kind)
     if rows.size == 0:
         return None

@@ -39,8 +39,8 @@ from beamline.storage.rules.pixels import (
 from beamline.storage.rules.stored_order import axis_vertical, sinogram_told, views_first
 from drivers.base.frame import FrameKind
 
-VARYING = "lengths"  # a rule on those that differ from view to view
-_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one view
+VARYING = "lengths"  # a rule on those that differ from projection to projection
+_JOINED_BLUR = 4.0  # columns at the edge of the field, from frames of one projection
 _OFF_MIDDLE = 0.05  # of the detector: a central ray nearer to its middle is as good as there
 
 
@@ -138,7 +138,7 @@ def pixels_square(scan: ScanEvidence) -> Iterator[Finding]:
 
 
 def joined_views(scan: ScanEvidence) -> str:
-    """Frames of one view that lie so far apart in angle that their mean is blurred."""
+    """Frames of one projection that lie so far apart in angle that their mean is blurred."""
     degrees = float(scan.source.attributes.get(JOINED_DEG, 0.0))
     blur = np.radians(degrees) * scan.source.shape[1] / 2
     return "" if blur <= _JOINED_BLUR else (

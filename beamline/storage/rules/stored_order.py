@@ -14,15 +14,15 @@ from beamline.storage.rules.pixels import SHAPES
 from recon.base.views import spread
 from recon.prep.unmeasured import with_borders_filled
 
-_TURNED = 12  # views by which the direction of the axis is found
-_LEAST = 8  # views, rows and columns: fewer tell nothing of it
-_LEAST_SQUARE = 16  # views and rows, as many
+_TURNED = 12  # projections by which the direction of the axis is found
+_LEAST = 8  # projections, rows and columns: fewer tell nothing of it
+_LEAST_SQUARE = 16  # projections and rows, as many
 _ON_A_SINE, _OFF_A_SINE, _OTHER_MASS = 0.9, 4.0, 4.0  # share of a change; times what is left of it; times a variance
 _HORIZONTAL = 10.0  # of the change of rows over that of columns; real scans have 0.001 to 0.03, turned ones the inverse
 
 
 def axis_vertical(scan: ScanEvidence) -> Iterator[Finding]:
-    """The rotation axis is parallel to the columns: each detector row then shows the same matter in every view."""
+    """The rotation axis is parallel to the columns, so each detector row shows the same material in all projections."""
     views = scan.table.views_with_angles
     if scan.table.shifts is not None or views.size < _LEAST or min(scan.source.shape) < _LEAST:
         return
@@ -61,12 +61,13 @@ def _exchanged(scan: ScanEvidence) -> str:
 
 
 def change_of_rows(depths: NDArray[np.float64]) -> float:
-    """Squared change of the row sums of [view, row, col] from view to view, relative to that of the column sums.
+    """Squared change of the row sums of [view, row, col] from projection to projection, relative to that of the column
+    sums.
 
-    About 1 where there is noise alone. Rotation about the columns moves matter along the rows, whose sums stay as they
-    are. What a drifting beam does to rows is in their ends, too, and so is matter that leaves a narrow field, from each
-    row in proportion to what is in it: a parabola over the rows and their mean profile, fitted to the ends, are taken
-    off.
+    About 1 where there is noise alone. Rotation about the columns moves material along the rows, whose sums stay as
+    they are. What a drifting beam does to rows is in their ends, too, and so is material that leaves a narrow field,
+    from each row in proportion to what is in it: a parabola over the rows and their mean profile, fitted to the ends,
+    are taken off.
     """
     change = depths - depths.mean(axis=0)
     ends = max(1, depths.shape[2] // 16)
@@ -80,10 +81,12 @@ def change_of_rows(depths: NDArray[np.float64]) -> float:
 
 
 def views_first(scan: ScanEvidence) -> Iterator[Finding]:
-    """If there are as many views as rows, the first dimension is that of the views, and the second that of the rows.
+    """If there are as many projections as rows, the first dimension is that of the projections, and the second that of
+    the rows.
 
-    In sinograms it is the other way round: of each image the rows are views, so that they have one mass, and the first
-    moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do not.
+    In sinograms it is the other way round: of each image the rows are projections, so that they have one mass, and the
+    first moments of all go along a sine of their angles (Helgason 1965; Ludwig 1966), while from image to image they do
+    not.
     """
     views = scan.table.views
     angles = scan.table.angles[views]
@@ -117,7 +120,7 @@ SINOGRAM = "sinogram"  # a rule whose finding is no fault, but which `info` and 
 
 
 def sinogram_told(scan: ScanEvidence) -> Iterator[Finding]:
-    """Tell what is taken for the views of an array [view, col], and how to state another order."""
+    """Tell what is taken for the projections of an array [view, col], and how to state another order."""
     axes = str(scan.source.attributes.get("dimensions", "")).split(",")
     if sorted(axes) == ["col", "frame"]:
         n = scan.table.views.size
@@ -142,7 +145,7 @@ def _explained(values: NDArray[np.float64], angles: NDArray[np.float64]) -> floa
 
 
 def _depths(scan: ScanEvidence, views: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Line integrals of some views [view, row, col], coarse, but for what all views share."""
+    """Line integrals of some projections [view, row, col], coarse, except for what all projections share."""
     block = max(1, min(max(scan.source.shape) // 128, min(scan.source.shape) // _LEAST))
     rows, cols = (n // block for n in scan.source.shape)
     darks = scan.table.darks[:1]

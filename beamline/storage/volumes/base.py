@@ -79,13 +79,13 @@ class VolumeFormat(Protocol):
 
     @property
     def greys(self) -> bool:
-        """Whether the format stores grey values of 8 and 16 bits."""
+        """True if the format stores grey values of 8 and 16 bits."""
 
     def write(self, path: Path, record: ReconRecord, slices: Slices) -> None:
         """Write a new file, slice by slice. Raises OSError if the disk refuses."""
 
     def holds(self, path: Path) -> bool:
-        """Whether the file is a volume in this format, written by this program; False if it cannot be read."""
+        """True if the file is a volume in this format, written by this program; False if it cannot be read."""
 
     def open(self, path: Path) -> AbstractContextManager[ReconRecord]:
         """The record of such a file; the volume's voxels are read when they are sliced along z.

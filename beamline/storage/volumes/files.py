@@ -188,7 +188,7 @@ class Npy:
                 file.write(values.data)
 
     def holds(self, path: Path) -> bool:
-        """Whether the file has three axes of numbers."""
+        """True if the file has three axes of numbers."""
         if not (path.name.lower().endswith(self.suffixes) and path.is_file()):
             return False
         try:
@@ -293,7 +293,7 @@ def whole_volume(
 
 
 def times_of(path: Path) -> tuple[float, ...]:
-    """Time of each of several volumes, in s from the first view on; empty if the file has no time series."""
+    """Time of each of several volumes, in s from the first projection on; empty if the file has no time series."""
     if not NXtomoproc().holds(path):
         return ()
     with hdf5.open_hdf5(path) as file, hdf5.readable(path):

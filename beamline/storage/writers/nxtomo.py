@@ -57,7 +57,7 @@ class _TouchedError(OSError):
 
 
 def _new_file(path: Path) -> h5py.File:
-    """DataError where the file exists or HDF5 cannot make it; nothing is left of it then."""
+    """DataError if the file exists or HDF5 cannot make it; nothing is left of it then."""
     try:
         return h5py.File(path, "x", libver=layout.LIBVER)
     except FileExistsError as error:
@@ -97,7 +97,7 @@ class NXtomoWriter:
             preview_bin: the bin that the digests' previews are made with.
             flush_every: frames between flushes; a crash loses at most the frames since the last one.
 
-        DataError where the file exists or cannot be made.
+        DataError if the file exists or cannot be made.
         """
         if flush_every < 1:
             raise ValueError(f"flush_every is {flush_every}; it must be at least 1.")
@@ -198,7 +198,7 @@ class NXtomoWriter:
         self._append_last(layout.PASS_ENDS, self._rows, "the end of a pass")
 
     def add_decision(self, values: Mapping[str, object]) -> None:
-        """Record what was chosen after a pass, likewise."""
+        """Record what was chosen after a pass, in the same way."""
         self._append_last(layout.DECISIONS, json_of(values).encode(), "a decision")
 
     def _append_last(self, path: str, value: int | bytes, what: str) -> None:
@@ -229,7 +229,7 @@ class NXtomoWriter:
             status, missing, reason: see ScanEnding.
             beam: readings of the beam monitor; kept where the file was made for them (ScanInfo.beam_unit).
 
-        DataError where the disk does not take it; the frames committed stay readable.
+        DataError if the disk does not take it; the frames committed stay readable.
         """
         if status not in STATUSES:
             raise ValueError(f"Status {status!r} is unknown; expected {', '.join(STATUSES)}.")
@@ -301,7 +301,7 @@ class NXtomoWriter:
                 self._file.close()
 
     def _require_untouched(self) -> None:
-        """Raise OSError where another program has cut the file or deleted it: HDF5 would write on, into a hole."""
+        """Raise OSError if another program has cut the file or deleted it: HDF5 would write on, into a hole."""
         now = os.fstat(self._handle)
         if now.st_nlink == 0 < self._before.st_nlink:  # where there are links at all
             raise _TouchedError(errno.ENOENT, "it was deleted")
@@ -340,7 +340,7 @@ class NXtomoWriter:
 
     def _put_exchange_view(self) -> None:
         """Add the /exchange view, which SWMR writing cannot, as it creates datasets; no frame depends on it."""
-        if hdf5.grows_here(self.path):  # where h5py has it open, HDF5 would cut the view off when that is closed
+        if hdf5.grows_here(self.path):  # where h5py has it open, HDF5 would cut the projection off when that is closed
             self.remarks.append(
                 f"{self.path} has no /exchange view, because this program has the file open with h5py. "
                 "Close it there; then `beamline recover` adds the view."

@@ -177,7 +177,7 @@ def _slabs_in(group: h5py.Group) -> list[Slab]:
 
 
 def is_partial(path: Path) -> bool:
-    """Whether a file is a partial volume, by its content."""
+    """True if a file is a partial volume, by its content."""
     if not path.is_file() or not hdf5.is_hdf5(path):
         return False
     try:

@@ -222,7 +222,7 @@ def _read_entry(entry: h5py.Group, at: int | None) -> ReconRecord:
 
 
 def _pitch(axis: NDArray[np.floating]) -> float | None:
-    """Distance from voxel to voxel; None where there is one voxel."""
+    """Distance from voxel to voxel; None if there is one voxel."""
     return float(axis[-1] - axis[0]) / (axis.size - 1) if axis.size > 1 else None
 
 

@@ -50,7 +50,7 @@ class Rows:
     def write(self, frame: Frame, digest: FrameDigest, mark: Mark = UNMARKED) -> None:
         """Write the row `frame.index`, an existing one or the next: pixels at once, metadata at the next `flush`.
 
-        A view that it replaces becomes an invalid frame, so that no program takes both.
+        A projection that it replaces becomes an invalid frame, so that no program takes both.
         """
         row = frame.index
         if row != self._first + len(self._said):
@@ -148,7 +148,7 @@ def has_exchange_view(file: h5py.File) -> bool:
 
 
 def put_exchange_view(path: Path) -> None:
-    """Add the view to a closed scan file. No block that frames hang on is written.
+    """Add the projection to a closed scan file. No block that frames hang on is written.
 
     Raises:
         DataError: the disk does not take it, or has less than ROOM free.
@@ -166,7 +166,7 @@ def put_exchange_view(path: Path) -> None:
 
 
 def _rows(file: h5py.File) -> dict[str, I64]:
-    """Rows of each dataset of the view."""
+    """Rows of each dataset of the projection."""
     table = frames_in(file)
     rows = {name: table.of_kind(kind) for kind, name in NAMES.items()}
     return {name: rows_of_kind for name, rows_of_kind in rows.items() if rows_of_kind.size}

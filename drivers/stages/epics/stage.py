@@ -183,7 +183,7 @@ class EpicsStage(LineStage):
 
     def wait(self, timeout: float) -> float:
         until_standing(self._clock, self.moving, bool, timeout)
-        status, target = self._status(), self._target  # read anew: RBV may have been read before DMOV became 1
+        status, target = self._status(), self._target  # read again: RBV may have been read before DMOV became 1
         arrived = target is None or self._is_at_target(status)
         if status.done and not (arrived or self._stops.came_since):
             # It says that it is done, and is not there: look whether it stands.

@@ -98,7 +98,7 @@ class PiGcsAxis:
         return bool(int(self._line.ask(ARE_THEY_MOVING, form, "the moving axes, as bits")[1], 16) >> self._bit & 1)
 
     def searching(self) -> bool:
-        """Whether the axis moves, or is between two parts of a reference move."""
+        """True if the axis moves, or is between two parts of a reference move."""
         return self._line.ask(READY, "[\xb0\xb1]", "the byte B1 (ready) or B0")[0] == "\xb0" or self.moving()
 
     def counts(self) -> int:

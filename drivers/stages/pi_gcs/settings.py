@@ -69,7 +69,7 @@ def window_of(train: TriggerTrain, first_pulse: PiFirstPulse) -> TriggerWindow:
 
 
 def is_spent_by(train: TriggerTrain, here: int, target: int) -> bool:
-    """Whether the train must be disarmed for a move from `here` to `target` (counts).
+    """True if the train must be disarmed for a move from `here` to `target` (counts).
 
     Either it was emitted, and passing it would emit it again. Or it has begun, and the way back would give pulses.
     """

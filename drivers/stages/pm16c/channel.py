@@ -111,7 +111,7 @@ class ChannelStatus:
 
     @property
     def stopped(self) -> bool:
-        """Whether the move was stopped."""
+        """True if the move was stopped."""
         return bool(STOPS & set(self.ending.split(", ")))
 
 

@@ -235,7 +235,7 @@ class ZaberStage(LineStage):
     def _before_move(self, counts: int, target: int) -> None:
         """Keep a train correct before a move from `counts` against it, because distance counts both ways.
 
-        A train under way ends. A train before its first pulse is set up anew, or ends if the stage had to move for it.
+        A train under way ends. A train before its first pulse is set up again, or ends if the stage had to move for it.
         """
         train, settings = self._train, self._settings
         if train is None or train.interval * (target - counts) >= 0:

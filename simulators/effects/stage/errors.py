@@ -89,7 +89,7 @@ class Backlash(PoseEffect):
 
 
 def came_forwards(angle_at: AngleAt, time: float) -> bool:
-    """Whether the stage turns forwards at `time` (s), or did so in its last move before."""
+    """True if the stage turns forwards at `time` (s), or did so in its last move before."""
     here = angle_at(time)
 
     def elsewhere(ago: float) -> bool:

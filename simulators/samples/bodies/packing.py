@@ -30,7 +30,7 @@ class Packed(NamedTuple):
         matrix: float64 [n, 3, 3]. ELLIPSOID: W with |W q| <= 1 inside, q from the centre.
         first_face: int64 [n + 1]; a POLYHEDRON's faces are first_face[i] to first_face[i + 1] of the next.
         faces: float64 [face, 4], unit normal and distance from the centre: normal · q <= distance inside.
-        first_vertex: int64 [n + 1], likewise.
+        first_vertex: int64 [n + 1], in the same way.
         vertices: float64 [vertex, 3], from the centre.
     """
 

@@ -282,7 +282,7 @@ class Palette:
     own: Mapping[str, Material] = field(default_factory=lambda: MappingProxyType({}))
 
     def __call__(self, name: str) -> Material:
-        """Raises ValueError where no material has this name."""
+        """Raises ValueError if no material has this name."""
         material = self.own.get(name) or known(name)
         if material is None:
             raise ValueError(

@@ -40,7 +40,7 @@ class Voxels:
     Attributes:
         padded: float32 [z + 2, y + 2, x + 2], 1/mm, with one voxel of zeros on all sides.
         spacing: mm from voxel to voxel along (z, y, x).
-        thresholds: 1/mm, ascending: label k from the k-th on; None where there is a `label_volume`.
+        thresholds: 1/mm, ascending: label k from the k-th on; None if there is a `label_volume`.
         label_volume: uint8 [z, y, x].
         names: of the labels 1, 2, ...
         radius: mm from the rotation axis to the farthest matter.
@@ -206,7 +206,7 @@ def _radius(volume: NDArray[np.float32], spacing: tuple[float, float, float]) ->
 
 
 MOST_COLUMNS = 100_000
-VIEWS = 8  # Views over half a turn in which the largest line integral is searched
+VIEWS = 8  # Views over 180 degrees in which the largest line integral is searched
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ _FEWEST, _BUSIEST = 30, 8  # projections, and binned rows, in which hardening is
 _EVENED, _MATTERS = 0.5, 0.05
 # by how much more the total absorption may vary afterwards, because the correction also amplifies noise
 _AS_EVEN = 1e-3
-_CURVED = 16  # float32 copies of a view while a curve corrects it
+_CURVED = 16  # float32 copies of a projection while a curve corrects it
 _RAYS, _VOLUMES = 10, 3  # float32 copies of the projections and of the volume during the fit of a curve
 _NODE = 40_000  # bytes of a curve per energy
 _RIM = 2.0  # voxels: shorter paths through the material are mostly its edges, which are blurred
@@ -166,7 +166,7 @@ def curve_of(views: F32, geometry: Geometry, step: Hardening) -> tuple[Curve | N
 
 
 def curve_memory(geometry: Geometry, step: Hardening) -> int:
-    """Peak memory in bytes of finding the hardening curve of such views and applying it."""
+    """Peak memory in bytes of finding the hardening curve of such projections and applying it."""
     from recon.voxels.fbp import fbp_memory
 
     view = _CURVED * 4 * math.prod(geometry.detector_shape)

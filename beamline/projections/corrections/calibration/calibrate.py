@@ -187,7 +187,7 @@ def calibrated(
         progress: how many steps are done, of how many at most.
 
     Raises:
-        DataError: too few views, or nothing in the beam.
+        DataError: too few projections, or nothing in the beam.
     """
     from beamline.projections.correction import line_integrals_of
     from recon.base.masks import areas

@@ -22,11 +22,11 @@ _MINUS = re.compile(r"minus|neg|[-\u2013\u2212mn]", re.IGNORECASE)
 _THOUSANDTHS = re.compile(r"_(?P<mark>)(?P<value>(?P<whole>\d{3})_(?P<part>\d{3}))(?=_\d+$)")
 _FOLLOWING = re.compile(r"[-_ ]?(\d{1,4})(?!\d)")  # more digits are of a date or a time
 _PRECEDING = re.compile(r"(?<!\d)(\d{1,4})[-_ ]?$")
-_LEAST_SPAN = 90.0  # degrees; numbers of tiles or of a time of day do not go so far from view to view
+_LEAST_SPAN = 90.0  # degrees; numbers of tiles or of a time of day do not go so far from projection to projection
 _FARTHEST = 3600.0  # degrees
 _TURN = 360.0  # degrees; a number with a sign but no word goes no further as an angle
 _EVEN, _ALIKE = 0.8, 0.3  # of the steps are alike, to so much of one: some images may be lost, angles are rounded
-_DISTINCT = 0.97  # of the angles: lost signs leave two of each; a scan may repeat some views at its end
+_DISTINCT = 0.97  # of the angles: lost signs leave two of each; a scan may repeat some projections at its end
 
 
 class NamedAngles(NamedTuple):
@@ -34,7 +34,7 @@ class NamedAngles(NamedTuple):
 
     Attributes:
         plain: the names without them.
-        radians: float64 [file]; None where the names state none, or may be read in two ways.
+        radians: float64 [file]; None if the names state none, or may be read in two ways.
         doubt: which ways these are; "" otherwise.
     """
 
@@ -106,7 +106,7 @@ def _without(name: str, angle: re.Match[str]) -> str:
 
 
 def _with_signs(numbers: list[list[re.Match[str]]]) -> list[re.Match[str]]:
-    """The one number that has a minus in some names and none in others; empty where there is no such, or several."""
+    """The one number that has a minus in some names and none in others; empty if there is no such, or several."""
     alike = len({len(row) for row in numbers}) == 1
     columns = [[*column] for column in zip(*numbers, strict=True)] if alike else []
     signed = [column for column in columns if 0 < sum(map(_is_minus, column)) < len(column)]
@@ -140,7 +140,7 @@ def _mark(number: re.Match[str]) -> str:
 
 
 def _separates(chosen: list[re.Match[str]], before: list[str], *, zero: bool) -> bool:
-    """Whether the mark before all numbers separates, as between a word and numbers of one width from 0 on: no sign
+    """True if the mark before all numbers separates, as between a word and numbers of one width from 0 on: no sign
     stands before 0. A hyphen in some names only is a sign."""
     wholes = [each["whole"] for each in chosen]
     padded = {len(whole) for whole in wholes} == {max(2, len(wholes[0]))}
@@ -163,6 +163,6 @@ def _doubt_of_decimals(chosen: list[re.Match[str]], before: list[str]) -> str:
 
 
 def _in_even_steps(ascending: NDArray[Any]) -> bool:
-    """Whether the steps of all numbers but a few are alike; some images may be lost."""
+    """True if the steps of all numbers but a few are alike; some images may be lost."""
     steps = np.diff(ascending)
     return bool(steps.all() and np.mean(np.abs(steps - np.median(steps)) < _ALIKE * np.median(steps)) > _EVEN)

@@ -23,7 +23,7 @@ _SHORT = re.compile(r"(?:^|[^a-z])(ob|df|dc|io|di)(?![a-z])")
 _PLAIN = re.compile(  # words of references, and those that go with them
     r"open[ _-]?beam|dark|flat|white|ob|df|dc|fields?|images?|frames?|pre|post|before|after|s\b|current"
 )
-_AFTER = re.compile(r"after|(?<![a-z])post(?![a-z])")  # of references taken after the views
+_AFTER = re.compile(r"after|(?<![a-z])post(?![a-z])")  # of references taken after the projections
 _DEGREES = re.compile(r"(?<!\d)(\d+)[ _-]?deg")  # of a folder
 COUNTED = 100  # range of the numbers over the count of files; above it the numbers do not count frames
 _DATE = 100_000  # from which a number beside that of the image is a date or a time, which may stay the same
@@ -99,12 +99,12 @@ class NamedImages:
     Attributes:
         names: of the files.
         kinds: int32 [file], values of FrameKind.
-        angles: float64 [file] radians, NaN where the name says none.
-        numbers: int64 [file], -1 of references that do not count with the series; None where files are not numbered.
-        of_series: int64 [projection], the numbers of the series; None where they count no images.
+        angles: float64 [file] radians, NaN if the name says none.
+        numbers: int64 [file], -1 of references that do not count with the series; None if files are not numbered.
+        of_series: int64 [projection], the numbers of the series; None if they count no images.
         plain: the names of the projections without their angles.
         doubt: why the angles in the names are not used; empty if they are used or the names have none.
-        half_turn: images in a folder of their own that is named after half a turn, which are invalid frames.
+        half_turn: images in a folder of their own that is named after 180 degrees, which are invalid frames.
     """
 
     names: list[str]
@@ -165,7 +165,7 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
 
 
 def _half_a_turn_on(series: list[str]) -> list[str]:
-    """Images in the one folder that is named after an angle of half a turn, or a whole one, beside all others."""
+    """Images in the one folder that is named after an angle of 180 degrees, or a whole one, beside all others."""
     stated = {name: _DEGREES.search(name.lower().rpartition("/")[0]) for name in series}
     named = [name for name, match in stated.items() if match and match[1] in ("180", "360")]
     return named if 2 * len(named) < len(series) and len(named) == sum(map(bool, stated.values())) else []
@@ -174,7 +174,7 @@ def _half_a_turn_on(series: list[str]) -> list[str]:
 def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_series: bool) -> NDArray[np.int64]:
     """The number of each image of a series, by its name without an angle. DataError: there are several series.
 
-    Series of which each counts anew follow one another, as where their names say of which kind they are.
+    Series of which each counts again follow one another, as where their names say of which kind they are.
 
     Args:
         images: of the scan, also those of other kinds.
@@ -194,7 +194,7 @@ def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_ser
 
 
 def _rank(name: str) -> int:
-    """Where the frames of a kind stand in a scan: darks, flats, views, and references that were taken afterwards."""
+    """Place of a kind of frames in a scan: darks, flats, projections, then darks and flats taken afterwards."""
     kind = _kind_of(name)
     return (FrameKind.DARK, FrameKind.FLAT, FrameKind.PROJECTION).index(kind) + 3 * (
         kind in _REFERENCES and _AFTER.search(name.lower()) is not None

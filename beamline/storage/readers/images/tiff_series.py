@@ -82,7 +82,7 @@ class TiffSeriesSource(ScanSource):
 
         Args:
             one_series: all images are one numbered series, whatever the names say of kinds.
-            listed: names of the images, all of them views; None: those that lie in the folder.
+            listed: names of the images, all of them projections; None: those that lie in the folder.
         """
         self.path = path
         self._zip = _open_zip(path) if path.is_file() else None
@@ -181,7 +181,7 @@ class TiffSeriesSource(ScanSource):
             raise UnreadableError(f"{name} in {self.path} cannot be read ({hdf5.reason(error)}).") from error
 
     def _readable(self, names: list[str], at_least: int = 0) -> list[tuple[tuple[int, int], np.dtype[Any]]]:
-        """Shape and type of the images of these files that can be read, by their heads; DataError where they are fewer
+        """Shape and type of the images of these files that can be read, by their heads; DataError if they are fewer
         than `at_least`.
 
         Of many bytes the first ones: to tell their type takes no more.
@@ -280,12 +280,12 @@ def _scene_of(path: Path) -> Path | None:
 def _open_scene(folder: Path) -> ScanSource:
     """The scan in the folder of a scene of R²-Gaussian (Zha et al. 2024, NeurIPS, github.com/Ruyi-Zha/r2_gaussian).
 
-    Its scanner has no unit of length: one of its units counts as 1 mm, so that densities are those of its volume. Views
-    and angles are taken as they stand. There the first row of a view is the highest z, and the source stands at
-    (DSO cos θ, DSO sin θ, 0): `_AXES` follows.
+    Its scanner has no unit of length: one of its units counts as 1 mm, so that densities are those of its volume.
+    Projections and angles are taken as they stand. There the first row of a projection is the highest z, and the source
+    stands at (DSO cos θ, DSO sin θ, 0): `_AXES` follows.
 
     Raises:
-        DataError: views are not there, or it is no cone or parallel beam.
+        DataError: projections are not there, or it is no cone or parallel beam.
     """
     meta: dict[str, Any] = json.loads(text_in(folder / _META))
     scanner, angles = meta["scanner"], {str(view["file_path"]): float(view["angle"]) for view in meta["proj_train"]}
@@ -361,7 +361,7 @@ def _of_stacks(path: Path, images: NamedImages) -> ScanSource:
 
 
 def _with_references_beside(source: TiffSeriesSource) -> TiffSeriesSource:
-    """The scan of the folder above, where its views are those of this one, and others are darks or flats."""
+    """The scan of the folder above, where its projections are those of this one, and others are darks or flats."""
     with suppress(DataError, OSError):  # what lies there is only looked at, and may be no scan
         above = TiffSeriesSource(source.path.absolute().parent)
         views = [Path(above.names[i]).parts[0] for i in above.table.views]

@@ -1,8 +1,8 @@
 """Scans of Zeiss (Xradia) microscopes: .txrm, an OLE compound file with a stream for each image and each list.
 
 Stream names, types and units after two public readers: dxchange (De Carlo et al. 2014, J. Synchrotron Rad. 21, 1224;
-with it CIL's ZEISSDataReader) and txrm2tiff (Diamond Light Source). Both divide views by the one reference without a
-dark, which the instrument has subtracted. Images are as they are stored.
+with it CIL's ZEISSDataReader) and txrm2tiff (Diamond Light Source). Both divide projections by the one reference
+without a dark, which the instrument has subtracted. Images are as they are stored.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class _Views:
 def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
     """Open a .txrm file. `own_angles` False: the caller supplies the angles, so the file may lack them.
 
-    DataError where olefile is not installed, or the file holds a volume, a mosaic, or what cannot be read.
+    DataError if olefile is not installed, or the file holds a volume, a mosaic, or what cannot be read.
     """
     with hdf5.readable(path):
         file = TxrmFile(path)
@@ -169,7 +169,7 @@ def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
     """Displacement of each image, [view, 2] pixels (col, row).
 
     The file holds the shift that brings each one back (drift, runout, encoder; txrm2tiff and MBIRTorch move images by
-    it). In a real file the displacement of each view against the one before has the opposite sign, too.
+    it). In a real file the displacement of each projection against the one before has the opposite sign, too.
     """
     shifts_by_axis = [file.numbers(f"Alignment/{axis}-Shifts", "<f4", n) for axis in "XY"]
     shifts = np.stack([np.zeros(n) if each is None else -each.astype(np.float64) for each in shifts_by_axis], axis=1)
@@ -179,7 +179,7 @@ def _shifts(path: Path, file: TxrmFile, n: int) -> NDArray[np.float64]:
 
 
 def _set_exposures(source: StacksSource, file: TxrmFile, n: int) -> None:
-    """Seconds of the views and of the reference, which may have its own."""
+    """Seconds of the projections and of the reference, which may have its own."""
     views = file.numbers("ImageInfo/ExpTimes", "<f4", n)
     source.table.exposures[-n:] = np.nan if views is None else np.where(views > 0, views, np.nan)
     for name in ("ReferenceData/ImageInfo/ExpTimes", "ReferenceData/ImageInfo/ExpTime", "ReferenceData/ExpTime"):

@@ -168,7 +168,7 @@ def _part(
 
 @njit(cache=True, nogil=True)
 def _all_apart(centres: Reals, bodies: Bodies, pairs: Wholes, ways: Reals, gap: float, work: Reals) -> bool:
-    """Whether all pairs are known to be apart at their present places."""
+    """True if all pairs are known to be apart at their present places."""
     for p in range(pairs.shape[0]):
         if _apart(centres, bodies, pairs[p, 0], pairs[p, 1], gap, ways[p], work) < gap:
             return False

@@ -54,7 +54,7 @@ class PieceBuilder(Protocol):
         """1/mm of each role, in a beam without energies."""
 
     def pieces(self) -> tuple[Piece, ...]:
-        """All pieces. Raises ValueError where they cannot be placed."""
+        """All pieces. Raises ValueError if they cannot be placed."""
 
 
 def check_roles(settings: PieceBuilder) -> None:
