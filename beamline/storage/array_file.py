@@ -65,7 +65,7 @@ class NamedArray:
 
 
 class ArrayFile(dict[str, NamedArray]):
-    """The arrays of a file by their paths; "" stands for the only one."""
+    """The arrays of a file by their paths; the path "" is the only array of a file."""
 
     def __init__(self, path: Path) -> None:
         self.filename, self.attrs, self.close = str(path), dict[str, Any](), lambda: None
@@ -90,10 +90,10 @@ class ArrayFile(dict[str, NamedArray]):
 
 
 def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz by their names, in memory; that of an .npy by "".
+    """The arrays of an .npz by name, in memory; the array of an .npy has the name "".
 
     Raises:
-        DataError: the memory does not hold them, or some are objects of Python.
+        DataError: they do not fit into memory, or some are Python objects.
         ValueError, OSError, ...: a damaged file.
     """
     try:
@@ -116,7 +116,7 @@ def numpy_arrays(path: Path, mapped: Literal["r"] | None = None) -> dict[str, ND
 
 
 def require_room(path: Path, n: int) -> None:
-    """Raise DataError if n bytes exceed the free memory: a damaged file may claim any size."""
+    """Raise DataError if n bytes exceed the free memory, because a damaged file may state any size."""
     if n > (free := free_memory()):
         raise DataError(
             f"{path} does not fit in memory: its header states {n / 1e9:.3g} GB, and {free / 1e9:.3g} GB "
@@ -125,7 +125,7 @@ def require_room(path: Path, n: int) -> None:
 
 
 def open_array_file(path: Path, follow: bool = False) -> Any:
-    """Open a file that has arrays by their names: HDF5, which may still grow, or `ArrayFile`."""
+    """Open a file with named arrays: HDF5, which may still grow, or `ArrayFile`."""
     return ArrayFile(path) if holds_arrays(path) else hdf5.open_hdf5(path, follow)
 
 
@@ -142,14 +142,16 @@ _PICKLES, _NUMPY = (".pickle", ".pkl", ".pck"), (".npy", ".npz")
 
 
 def holds_arrays(path: Path) -> bool:
-    """True if a path is an .npy, an .npz or a Zarr. DataError: a pickle, whose arrays are read once converted."""
+    """True for the path of an .npy, an .npz or a Zarr. Raises DataError for a pickle, whose arrays can be read after a
+    conversion.
+    """
     if path.is_file() and path.suffix.lower() in _PICKLES:
         raise DataError(_PICKLE.replace("{0}", str(path)))
     return (path.suffix.lower() in _NUMPY and path.is_file()) or zarr_root(path) is not None
 
 
 def zarr_root(path: Path) -> str | None:
-    """Where in a folder or .zip a Zarr begins; None without one."""
+    """Path of the Zarr within a folder or .zip; None if there is none."""
     if path.is_dir():
         return "" if is_zarr(path) else None
     if path.suffix.lower() != ".zip" or not path.is_file() or not zipfile.is_zipfile(path):

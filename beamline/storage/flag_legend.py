@@ -43,8 +43,8 @@ class Mark:
 
     Attributes:
         bits: as `beamline.monitor.checks.bitmask` makes them.
-        scores: float32 [check], in the order of the legend; NaN if the check did not flag the frame, or only when
-            it saw later ones.
+        scores: float32 [check], in the order of the legend; NaN if the check did not flag the frame, or flagged it only
+            after later frames.
         regions: int32 [check, 4], first row, row after the last, first column, column after the last; -1: none.
     """
 
@@ -95,7 +95,7 @@ class FrameFlags:
 
     @classmethod
     def of_marks(cls, marks: Sequence[Mark]) -> FrameFlags:
-        """The flags of frames as today's checks found them."""
+        """The flags of frames as the present checks found them."""
         return cls(
             np.array([mark.bits for mark in marks], np.uint64),
             TODAY,
@@ -105,7 +105,7 @@ class FrameFlags:
 
     @classmethod
     def of_flags(cls, found: Sequence[Sequence[Flag]]) -> FrameFlags:
-        """Marks [row] of the frames of a file with these flags; a flag for earlier rows marks these, too."""
+        """Marks [row] of the frames of a file with these flags; a flag that refers to earlier rows marks these, too."""
         flags = cls.of_marks([mark_of(flag for flag in each if flag.frame == row) for row, each in enumerate(found)])
         for flag in chain.from_iterable(found):
             rows, at = flag.frames, place_of(flag)
@@ -117,7 +117,7 @@ class FrameFlags:
         return flags
 
     def mark(self, frame: int) -> Mark:
-        """The row of a frame as today's checks would write it, without checks that do not exist now."""
+        """The row of a frame as the present checks would write it, without checks that no longer exist."""
         mark = Mark(0, UNMARKED.scores.copy(), UNMARKED.regions.copy())
         bits, row = 0, int(self.bits[frame])
         for i, entry in enumerate(self.legend):
@@ -128,7 +128,7 @@ class FrameFlags:
         return replace(mark, bits=bits)
 
     def of_today(self) -> FrameFlags:
-        """The same flags with today's bits, without checks that no longer exist."""
+        """The same flags with the bits of the present version, without checks that no longer exist."""
         return FrameFlags.of_marks([self.mark(frame) for frame in range(self.bits.size)])
 
     @property
@@ -158,10 +158,10 @@ class FrameFlags:
 
     @classmethod
     def joined(cls, each: Sequence[FrameFlags | None], sizes: Sequence[int] | NDArray[np.int64]) -> FrameFlags | None:
-        """The flags of several scans, one after another, by the number of frames of each; None for those that no
-        monitor looked at.
+        """The flags of several scans, one after another, given the number of frames of each; None for scans that no
+        monitor checked.
 
-        The legend is theirs if they have the same, else today's.
+        If all have the same legend it is kept, otherwise the present one is used.
         """
         known = [flags for flags in each if flags is not None]
         if not known:

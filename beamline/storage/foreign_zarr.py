@@ -26,7 +26,8 @@ Spacing = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class ZarrScale:
-    """A scale of a volume, read box by box: an array [..., z, y, x] of a Zarr store whose leading axes have length one.
+    """One scale of a volume, read box by box: an array [..., z, y, x] of a Zarr store whose leading axes have length
+    one.
 
     Attributes:
         coarser: the same volume with fewer voxels.
@@ -91,7 +92,7 @@ def open_zarr(path: Path, dataset: str | None = None) -> tuple[ZarrScale, Spacin
 
 
 def _require_volume(path: Path, array: Any) -> None:
-    """DataError for an array that is no volume of real numbers."""
+    """Raise DataError for an array that is not a volume of real numbers."""
     if array.ndim < 3 or any(n != 1 for n in array.shape[:-3]) or np.dtype(array.dtype).kind not in "uifb":
         raise DataError(
             f"{path} contains {array.dtype} of shape {array.shape}; expected real numbers [z, y, x] of "
@@ -100,7 +101,7 @@ def _require_volume(path: Path, array: Any) -> None:
 
 
 def _require_chunks(path: Path, array: Any) -> None:
-    """DataError for an impossible shape, and for chunks that the memory does not hold."""
+    """Raise DataError for an impossible shape, and for chunks that do not fit into memory."""
     try:
         shape_of(array.shape[-3:])
         piece = math.prod(shape_of(array.chunks[-3:], "chunk")) * np.dtype(array.dtype).itemsize
@@ -123,7 +124,7 @@ def _spacing(image: Mapping[str, Any], axes: int, name: str) -> Spacing | None:
 
 
 def is_halved(finest: tuple[int, ...], array: Any) -> bool:
-    """Whether halving one shape repeatedly gives the shape of an array, along each axis, rounded either way."""
+    """True if repeated halving of one shape gives the shape of an array, along each axis, rounded either way."""
     shape = getattr(array, "shape", ())[-3:]  # a group has none
     if len(shape) < 3 or min(*shape, *finest) < 1:
         return False

@@ -39,12 +39,13 @@ class UnreadableError(DataError):
 
 
 def open_hdf5(path: Path, follow: bool = False) -> h5py.File:
-    """Open for reading, even a file that is being written or whose process was killed (SWMR).
+    """Open for reading, even a file that is being written or whose program was killed (SWMR).
 
-    HDF5 shares a file within a program. A reader beside the writer would see half of the file, and write to it at the
-    end. Two followers of one file would both read wrong values. So such a file gets a handle of its own.
+    HDF5 shares a file within a program. A reader in the program that writes would see half of the file, and write to it
+    at the end. Two readers that follow one file would both get wrong values. Therefore such a file gets a handle of its
+    own.
 
-    Raises DataError if it is not a readable HDF5 file, or draws on a path that is not a file (see storage.structure).
+    Raises DataError if it is not a readable HDF5 file, or refers to a path that is not a file (see storage.structure).
     NotReadyError: it may become one (`follow`).
     """
     if not path.is_file():
@@ -135,7 +136,7 @@ def _apart(path: Path, head: Superblock | None, follow: bool) -> h5py.File:
 def look_again(item: h5py.Dataset) -> None:
     """Refresh a dataset of a growing file.
 
-    HDF5 2.0 reads wrong values after a refresh of a dataset that is open twice, as one of an ended file may be.
+    HDF5 2.0 reads wrong values after a refresh of a dataset that is open twice, which can happen with a finished file.
     """
     plist = item.file.id.get_access_plist()
     if item.file.id.get_intent() != h5py.h5f.ACC_RDONLY or plist.get_driver() == h5py.h5fd.fileobj_driver:
@@ -143,10 +144,10 @@ def look_again(item: h5py.Dataset) -> None:
 
 
 def n_written(item: Any) -> int:
-    """How many frames or values of a growing dataset are there.
+    """Number of frames or values of a growing dataset that are already written.
 
-    Its writer may have made room for more: for frames of which no chunk is stored yet, or for values at the end of a
-    list that are its fill value or NaN.
+    Its writer may have allocated more: frames of which no chunk is stored yet, or values at the end of a list that are
+    its fill value or NaN.
     """
     look_again(getattr(item, "item", item))
     if item.ndim == 1:
@@ -161,8 +162,8 @@ def n_written(item: Any) -> int:
 def is_hdf5(path: Path, follow: bool = False) -> bool:
     """True if the path is an HDF5 file: by its signature, at the start or after a user block.
 
-    h5py.is_hdf5 says no to a file that is being written. A path that does not exist, or that is followed, counts as
-    HDF5: `open_hdf5` says what is wrong with it, or that it is not ready.
+    h5py.is_hdf5 returns False for a file that is being written. A path that does not exist, or that is followed, counts
+    as HDF5: `open_hdf5` then reports what is wrong with it, or that it is not ready.
     """
     if follow or not path.is_file():
         return True
@@ -200,9 +201,10 @@ _CONTENT = r"array|bytes|unsized|'(Dataset|Datatype|Empty|Group|str)'"  # of a T
 
 
 def _of_our_own(error: Exception) -> bool:
-    """True if a mistake of a reader raised it, and no library that met what it did not expect.
+    """True if a programming error in a reader raised it, and not a library that found something unexpected.
 
-    A dataset where a group was expected lacks that group's attributes: the object is the file's then.
+    If a dataset is where a group was expected, the group's attributes are missing: then the object is the file's, and
+    the error counts as one of the file.
     """
     content = isinstance(
         getattr(error, "obj", None), h5py.HLObject | h5py.Empty | np.ndarray | np.generic | str | bytes
@@ -224,7 +226,7 @@ def closed_on_error(file: Any) -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """The reason of the disk or the system, in its own words, without HDF5's addresses and offsets."""
+    """The reason that the disk or the system gives, in its own words, without HDF5's addresses and offsets."""
     message = re.search(r"error message = '([^']*)'", str(error))
     return message[1] if message else (isinstance(error, OSError) and error.strerror) or str(error)
 
@@ -242,7 +244,7 @@ def created(path: Path, libver: str | tuple[str, str] | None = None) -> Abstract
     """Create a file. At the end of the block it is flushed to the disk.
 
     Raises:
-        OSError: the disk refused the bytes; the file is closed and stays.
+        OSError: the disk failed; the file is closed and stays.
     """
     return _written(path, "x", libver)
 

@@ -83,7 +83,9 @@ def volume_file(path: Path) -> Path:
 
 
 def _no_run(folder: Path, wanted: str) -> Path:
-    """The folder, which may hold slices, say. DataError: it is the folder of a run, or of runs."""
+    """The folder itself, which may contain slices for example. Raises DataError if it is the folder of a run, or of
+    runs.
+    """
     if (folder / EVENTS).is_file():
         raise DataError(
             f"{folder} is the folder of a run without a {wanted}, because the run ended before its first frame."
@@ -145,7 +147,7 @@ def _step_of_run(run: Path) -> str:
 
 
 def is_ride(run: Path) -> bool:
-    """True if a run recorded the scan of another program, which alone can take more of it."""
+    """True if a run recorded the scan of another program; only that program can continue it."""
     config = run / CONFIG
     return config.is_file() and "\nride:" in config.read_text(encoding="utf-8", errors="replace")
 
@@ -154,12 +156,12 @@ _MAKES = "makes an ordinary file of the complete frames"
 
 
 def _died(sure: bool) -> str:
-    """A sentence on a writer that died; where the disk has no locks, it may still run."""
+    """A sentence on a process that was killed; on a disk without locks, it may still be running."""
     return "The process of its scan was killed" + ("" if sure else ", unless a program is still writing to it")
 
 
 def _lacks_views(run: Path) -> bool:
-    """True if the files of a run, all closed, lack projections that it was to take, wide ones included."""
+    """True if projections are missing in the files of a run, which are all closed; offset projections included."""
     with suppress(DataError, *hdf5.ALTERED), ExitStack() as opened:
         files = [opened.enter_context(hdf5.open_hdf5(part)) for part in files_with_frames(run)]
         return bool(still_to_take(files)[0]) or offset_planned(files[0]) > len(offset_taken(files))
@@ -167,15 +169,16 @@ def _lacks_views(run: Path) -> bool:
 
 
 def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str, ...], bool]:
-    """Projections that a scan still has to take, by its plan and what it chose; nothing for a file without its plan.
+    """Projections that a scan still has to take, from its plan and its decisions; none for a file without its plan.
 
     Args:
-        files: all of the scan, in the order that they were taken in, or the one that joins them.
+        files: all files of the scan, in the order in which they were taken, or the one that joins them.
 
     Returns:
-        The triggers of these views, counted from 0: not those that the scan decided against, but those of a pass that
-        it was taking again. What it chose after each pass that ended, `Choice.NEXT` where the files do not say. Whether
-        a choice is due: the last pass has ended, and neither a choice nor a projection follows.
+        The triggers of these projections, counted from 0: without those that the scan decided to omit, but with those
+            of a pass that it was taking again. What it chose after each pass that ended, `Choice.NEXT` if the files do
+            not state it. True if a choice is due: the last pass has ended, and neither a choice nor a projection
+            follows.
     """
     views, since_pass_end, chosen, n_ended = set[int](), set[int](), dict[str, str](), 0
     for file in files:
@@ -196,7 +199,9 @@ def still_to_take(files: Sequence[h5py.File]) -> tuple[frozenset[int], tuple[str
 
 
 def n_still_to_take(file: h5py.File) -> int | None:
-    """How many projections `still_to_take` has for a file; None: not known, as what it chose is damaged."""
+    """Number of projections in `still_to_take` for a file; None: not known, because the record of its choices is
+    damaged.
+    """
     with suppress(*hdf5.ALTERED):
         return len(still_to_take([file])[0])
     return None

@@ -63,10 +63,10 @@ def plan_in(file: h5py.File) -> dict[str, Any]:
 
 
 def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
-    """Triggers before the last view without a frame, judged by the frames themselves: for files whose process was
-    killed.
+    """Triggers without a frame before the last projection, found from the frames themselves: for files whose process
+    was killed.
 
-    None of a later part of a run, which takes what the parts before lack, and of files without their plan.
+    None for a later part of a run, which takes what is missing in the parts before, and for files without their plan.
     """
     table = frames_in(file)
     views = table.views
@@ -81,10 +81,11 @@ def gaps_in(path: Path, file: h5py.File) -> tuple[int, ...]:
 
 
 def end_references_missing(files: Sequence[h5py.File]) -> frozenset[FrameKind]:
-    """Kinds of references planned after the projections that are missing, wholly or in part, in the files of a scan.
+    """Kinds of darks and flats planned after the projections that are missing, completely or in part, in the files of a
+    scan.
 
     Args:
-        files: all of the scan, in the order that they were taken in.
+        files: all files of the scan, in the order in which they were taken.
     """
     taken = _after_views(files)
     return frozenset(kind for kind, n in _planned(files[0], "end").items() if len(taken[kind]) < n)
@@ -142,7 +143,7 @@ def files_with_frames(run: Path, name: str = SCAN) -> list[Path]:
 
 
 def may_hold_frames(part: Path) -> bool:
-    """True if a part may have frames: its file has one, or its log of events (perhaps not all) names one.
+    """True if a part may have frames: its file has one, or its log of events (perhaps incomplete) names one.
 
     A part that ended before its first frame does not count.
     """

@@ -50,16 +50,18 @@ class PoseTable:
 
     Attributes:
         path: of the file.
-        by: what `keys` are: rows of the scan file, projections counted from 0 in its order, or angles in degrees.
+        by: meaning of `keys`: rows of the scan file, projections counted from 0 in its order, or angles in degrees.
         keys: float64 [row], all different.
         angles_deg: float64 [row] of the projections, to be compared with the scan's; None if the file has none.
         shifts: float64 [row, 2], displacement of the image along (columns, rows), in `unit`.
-        turns_deg: float64 [row, 2], roll and tilt, as of `recon.base.geometry.Geometry`.
+        turns_deg: float64 [row, 2], roll and tilt, as in `recon.base.geometry.Geometry`.
         unit: "px" of the unbinned detector, or "mm" at the sample.
-        frames: of the scan that the file was made with; None: not known.
-        axis_col: of the volume that the poses are of, in columns of the whole detector; None: not known.
-        vectors: float64 [row, 12] in mm, as of `recon.base.vectors`, which state all of the geometry; None: no such.
-        cone: the vectors are of a cone.
+        frames: number of frames of the scan for which the file was made; None: not known.
+        axis_col: rotation axis of the volume with which the poses were found, in columns of the whole detector; None:
+            not known.
+        vectors: float64 [row, 12] in mm, as in `recon.base.vectors`, which state the complete geometry; None: no
+            vectors.
+        cone: the vectors are of a cone beam.
     """
 
     path: Path
@@ -101,7 +103,7 @@ class PoseTable:
 
 
 class _NoPosesError(Exception):
-    """A sound file that does not state poses: a ValueError would be taken for damage."""
+    """A valid file that does not state poses: a ValueError would be mistaken for damage."""
 
 
 def read_poses(text: str) -> PoseTable:
@@ -245,7 +247,9 @@ POSES_KEPT = "view_shifts_px", "view_roll_deg", "view_tilt_deg"
 
 
 def _of_nexus(path: Path, file: h5py.File, ways: tuple[str, str] | None) -> PoseTable:
-    """Translations of the sample, in mm from their median: a common one is no displacement of a projection."""
+    """Translations of the sample, in mm from their median, because a common translation is not a displacement of a
+    projection.
+    """
     places = choose(file, find(file))
     kinds = places.kinds()
     shown = kinds == FrameKind.PROJECTION

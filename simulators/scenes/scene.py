@@ -11,7 +11,7 @@ electrons:
     axis_offset_px: 3.4                 # rotation axis right of the sensor's middle, in sensor pixels
     effects: [photon_noise, {kind: zingers, rate: 5.0}]
     detector: {shape: [512, 512]}       # for `beamline simulate`; an instrument's configuration brings its own
-    scan: {views: 180}                  # in the same way
+    scan: {views: 180}                  # likewise
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
     """Radians from a file, or from an array in radians.
 
     Args:
-        unit: "deg" or "rad", whatever the file says; None: as it says.
+        unit: "deg" or "rad", whatever the file states; None: the unit that it states.
 
     Raises:
         DataError: they cannot be read, or several lists could be meant.
@@ -50,14 +50,14 @@ def load_angles(angles: Angles, unit: str | None = None) -> NDArray[np.float64]:
 
 
 def angles_at(path: Path, where: str, unit: str | None, default: str = "") -> NDArray[np.float64]:
-    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy, a list or a column.
+    """Angles in radians of the array `where` of an HDF5 file, a Zarr or an .npy: a list or a column.
 
     Args:
-        where: "": the only list whose unit is one of angles, or the only array.
-        unit: "deg" or "rad", whatever the file says; None: as it says, or `default` where it says none.
+        where: "": the only list with a unit of angles, or the only array.
+        unit: "deg" or "rad", whatever the file states; None: the unit that it states, or `default` if it states none.
 
     Raises:
-        DataError: it is not there, is no list, or nothing says its unit.
+        DataError: the array does not exist, is not a list, or has no known unit.
     """
     with closing(open_array_file(path)) as file, hdf5.readable(path):
         if not where and isinstance(file, h5py.File):
@@ -147,16 +147,18 @@ def assign(
 ) -> NDArray[np.float64]:
     """Assign an angle in radians to each frame of a source, NaN if unknown.
 
-    There is one angle for each projection; or one for each number of a series of files, where some are lost; or one for
-    each frame, where the order of all frames is known. A log that holds nan for each dark and flat tells it, too. A log
-    whose steps are equal from end to end has no rows of darks and flats, for which a stage stands.
+    There may be one angle for each projection; or one for each number of a series of files of which some are missing;
+    or one for each frame, if the order of all frames is known. A log with nan for each dark and flat also tells that
+    order. A log whose steps are equal from end to end contains no rows of darks and flats, because the stage stands
+    still for these.
 
     Args:
         name: where the angles come from, for messages.
         of_views: the angles are those of projections alone.
 
     Raises:
-        DataError: the angles fit none of these. It names the rows that are surely those of the projections, if any are.
+        DataError: the angles fit none of these cases. The message names the rows that are certainly those of the
+            projections, if there are any.
     """
     projections, numbers = source.table.views, source.table.numbers
     series = None if numbers is None else numbers[projections]
@@ -253,8 +255,8 @@ def _misfit(source: ScanSource, angles: NDArray[np.float64], name: str, series: 
 def evenly_spaced_window(angles: NDArray[np.float64], n: int) -> tuple[int, int] | None:
     """First and last row of the n consecutive rows with the most equal steps; None if the choice is ambiguous.
 
-    A scan's angle log often holds the darks and flats as well, at a standing stage. If the steps go on beyond these
-    rows, other rows would do as well: then projections were lost, and nothing tells which.
+    A scan's angle log often also contains the darks and flats, during which the stage stands still. If equal steps
+    continue beyond these n rows, other rows would fit as well: then projections are missing, and it is unknown which.
     """
     if n < 3 or angles.size <= n or not np.isfinite(angles).all():
         return None

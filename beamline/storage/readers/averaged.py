@@ -22,16 +22,16 @@ _EXACT = 2  # bytes of a whole number, whose sums over a projection uint32 holds
 
 
 class AveragedSource(Frames):
-    """A ScanSource whose projections are means of those of `base`; darks and flats are unchanged, invalid frames are
-    omitted.
+    """A ScanSource whose projections are means of several projections of `base`; darks and flats are unchanged, invalid
+    frames are omitted.
 
-    A projection is up to `n` projections that follow one another, closer in angle than the last frames of a projection
-    and the first of the next. So a projection that lacks frames takes none of its neighbour's. Of a growing file a
-    projection is there once a frame of the next one is, or its n-th.
+    A mean combines up to `n` consecutive frames that are closer in angle than frames of different projections. So a
+    projection with missing frames takes none of its neighbour's. In a growing file a projection is complete as soon as
+    a frame of the next one, or its n-th frame, exists.
 
-    The mean is that of the frames without an alarm, or of all where each has one. Whole numbers are summed as such,
-    real ones in float64; their mean is rounded once, to float32 (a part in 10^7). Frames that are damaged or cannot be
-    read have no part in it.
+    The mean is that of the frames without an alarm, or of all if each has one. Integers are summed as such, real
+    numbers in float64; the mean is rounded once, to float32 (a part in 10^7). Frames that are damaged or cannot be read
+    are left out.
     """
 
     def __init__(self, base: ScanSource, n: int) -> None:

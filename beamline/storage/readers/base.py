@@ -31,8 +31,9 @@ WHOLE = slice(None)
 
 
 class NotUsed(NamedTuple):
-    """A field of a file that is ignored: its path, its value, why or what to do, whether it may matter, and whether a
-    volume without it is wrong by more than a hundredth."""
+    """A field of a file that is ignored: its path, its value, the reason or what to do, whether it may matter, and
+    whether a volume without it is wrong by more than a hundredth.
+    """
 
     where: str
     value: str
@@ -182,9 +183,9 @@ def frame_indices(frames: slice | ArrayLike, n: int) -> NDArray[np.int64]:
 
 
 def read_known(source: ScanSource, frames: slice | ArrayLike, rows: slice = WHOLE) -> NDArray[Any]:
-    """`source.read`, with NaN (0 for integers) for unreadable frames: see its `unreadable`.
+    """`source.read`, with NaN (0 for integers) for unreadable frames, see `unreadable`.
 
-    A real number beyond LARGEST, which no detector counts and which float32 may not hold, is NaN, too.
+    Real numbers beyond LARGEST, which no detector counts and which float32 may not represent, also become NaN.
     """
     try:
         return measured(source.read(frames) if rows == WHOLE else source.read(frames, rows))
@@ -215,7 +216,7 @@ def measured(pixels: NDArray[Any]) -> NDArray[Any]:
 
 
 class TakesTooLongError(DataError):
-    """The check was ended because it would take too long; findings so far are valid."""
+    """The check was ended because it would take too long; the findings so far are valid."""
 
 
 @dataclass(frozen=True)
@@ -224,9 +225,10 @@ class Opening:
 
     Attributes:
         follow: the file may still be growing.
-        own_angles: the file's angles are used; False: the caller brings them, so the file may lack them.
-        one_series: the caller says the kind of each frame; names of files say none.
-        counts: the caller says that pixels are counts, and gives no references: they may lie beside the projections.
+        own_angles: the file's angles are used; False: the caller supplies the angles, so the file need not have any.
+        one_series: the caller states the kind of each frame; names of files are not used for that.
+        counts: the caller states that pixels are counts, and gives no darks and flats: they may lie next to the
+            projections.
     """
 
     follow: bool = False

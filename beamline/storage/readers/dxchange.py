@@ -93,8 +93,8 @@ class ExchangeSource(StacksSource):
     """A scan in a Data Exchange file.
 
     Attributes:
-        own_angles: those of the file are used.
-        grows: it was still being written when it was opened. Its frames are numbered as they come.
+        own_angles: the angles of the file are used.
+        grows: it was still being written when it was opened. Its frames are numbered as they arrive.
     """
 
     own_angles: bool = True
@@ -149,8 +149,9 @@ def _thetas(file: h5py.File, stacks: Sequence[FrameStack]) -> dict[FrameKind, ND
 
 
 def _later_flats(file: h5py.File, n: int) -> int | None:
-    """The first of n flats that were taken after the projections, where the acquisition says that it took them at both
-    ends, as many each time."""
+    """The first of n flats that were taken after the projections, if the acquisition states that it took equally many
+    before and after.
+    """
     mode = datasets.dataset(file, f"{_FLATS}/flat_field_mode")
     each = datasets.scalar(file, f"{_FLATS}/num_flat_fields", _ANY) or n // 2
     return n // 2 if mode is not None and _words(mode).lower() == "both" and 2 * each == n > 0 else None
@@ -225,7 +226,9 @@ def _set_scale(source: ExchangeSource, file: h5py.File) -> None:
 def _measured(
     source: ExchangeSource, file: h5py.File, where: str, units: Mapping[str, float], range: tuple[float, float]
 ) -> float | None:
-    """A positive number; without a unit it is taken as SI, as the format says, if it then lies in a range."""
+    """A positive number. Without a unit it is assumed to be SI, as the format says, if the value is then in a plausible
+    range.
+    """
     value, item = _positive(file, where, units), datasets.dataset(file, where)
     if value is None or item is None or datasets.attribute(item, "units") or range[0] <= value <= range[1]:
         return value
@@ -266,8 +269,9 @@ def _theta(file: h5py.File, n_views: int, all_there: bool = True) -> NDArray[np.
 
 
 def _of_rotation(file: h5py.File, what: str) -> float | None:
-    """The one number, in radians, that the acquisition or attributes of the exchange data state of the rotation, in
-    degrees unless it has a unit; None: several or none."""
+    """The one number, in radians, that the acquisition or attributes of the exchange data state for the rotation, in
+    degrees unless it has a unit; None: several or none.
+    """
     attributes = [item.attrs.get(f"rotation_{what}") for item in (file["exchange"], file["exchange/data"])]
     by_group = datasets.scalar(
         file, f"process/acquisition/rotation/{what}", {**datasets.ANGLE_UNITS, "": math.radians(1)}

@@ -52,19 +52,19 @@ class Crumb:
 class Floaters(ImageEffect, Anomaly):
     """Crumbs on the outside of the can or elsewhere in the beam.
 
-    Turning loose particles turn with the stage. A loose particle beyond the frame's width crosses the frame twice a
+    Turning particles turn with the stage. A loose particle beyond the frame's width crosses the frame twice a
     turn, in front of the axis and behind it. Within 180 degrees it crosses once, in a range of views, on one side.
-    Loose loose particles drift across at a speed of their own. All rows show a loose particle at its place when the
+    Loose particles drift across at a speed of their own. All rows show a loose particle at its place when the
     first row is exposed.
 
     Attributes:
-        distance: [least, most] mm from the rotation axis; a loose loose particle is visible within the larger distance.
+        distance: [least, most] mm from the rotation axis; a loose particle is visible within the larger distance.
         count: number of loose particles.
         size: [least, most] mm, standard deviation of the cloud.
         depth: largest optical depth through the middle of a loose particle; the smallest is half of it.
         heights: [least, most] mm, down the rows from z = 0.
         motion: "turning" with the stage, or "loose".
-        speed: mm a view, the drift of a loose loose particle in either direction.
+        speed: mm a view, the drift of a loose particle in either direction.
         views: [first, one after the last] in which loose particles exist; a loose one passes the axis within it.
         seed: of sizes, places and depths.
     """

@@ -34,7 +34,7 @@ class NamedAngles(NamedTuple):
 
     Attributes:
         plain: the names without them.
-        radians: float64 [file]; None if the names state none, or may be read in two ways.
+        radians: float64 [file]; None if the names state none, or can be read in two ways.
         doubt: which ways these are; "" otherwise.
     """
 
@@ -68,7 +68,7 @@ def angles_in(names: Sequence[str]) -> NamedAngles:
 
 
 def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[re.Match[str]], bool]:
-    """The number in each name that may be its angle (fewer if some have none), and whether a word marks it."""
+    """The number in each name that may be its angle (fewer if some names have none), and whether a word marks it."""
     worded = [[number for number in row if number["word"] or number["unit"]] for row in numbers]
     if any(worded):
         return [row[0] for row in worded if len(row) == 1], True
@@ -78,13 +78,13 @@ def _chosen(stems: list[str], numbers: list[list[re.Match[str]]]) -> tuple[list[
 def _doubt_of_series(
     chosen: list[re.Match[str]], distinct: NDArray[np.float64], doubt: str, *, words: bool, another: bool
 ) -> str:
-    """Why the numbers of a series may be no angles; "" where they are.
+    """Why the numbers of a series may not be angles; "" if they are.
 
     Args:
         distinct: degrees, ascending.
-        doubt: of their signs and decimals.
-        words: a word stands beside them.
-        another: another number differs from name to name, and counts no images.
+        doubt: about their signs and decimals.
+        words: a word stands next to them.
+        another: another number differs from name to name, and does not count images.
     """
     counted = are_a_count([each["value"] for each in chosen]) and (another or len(chosen[0]["value"]) > 3)
     uneven = chosen[0].re is _NUMBER and (np.abs(distinct).max() > _TURN or not _in_even_steps(distinct))
@@ -106,7 +106,7 @@ def _without(name: str, angle: re.Match[str]) -> str:
 
 
 def _with_signs(numbers: list[list[re.Match[str]]]) -> list[re.Match[str]]:
-    """The one number that has a minus in some names and none in others; empty if there is no such, or several."""
+    """The one number that has a minus in some names and none in others; empty if there are none or several."""
     alike = len({len(row) for row in numbers}) == 1
     columns = [[*column] for column in zip(*numbers, strict=True)] if alike else []
     signed = [column for column in columns if 0 < sum(map(_is_minus, column)) < len(column)]
@@ -118,7 +118,7 @@ def _is_minus(number: re.Match[str]) -> bool:
 
 
 def _read(chosen: list[re.Match[str]]) -> tuple[NDArray[np.float64], str]:
-    """Degrees, and why they may be others; "" where they are sure."""
+    """Degrees, and why they may be different; "" if they are certain."""
     degrees = np.array([float(re.sub("[,p_]", ".", each["value"].lower())) for each in chosen])
     before = [each.string[: each.start("mark" if each["mark"] else "value")] for each in chosen]
     minus = np.array([*map(_is_minus, chosen)])
@@ -140,8 +140,9 @@ def _mark(number: re.Match[str]) -> str:
 
 
 def _separates(chosen: list[re.Match[str]], before: list[str], *, zero: bool) -> bool:
-    """True if the mark before all numbers separates, as between a word and numbers of one width from 0 on: no sign
-    stands before 0. A hyphen in some names only is a sign."""
+    """True if the mark before all numbers is a separator, as between a word and numbers of one width from 0 on, because
+    there is no sign before 0. A hyphen in only some names is a sign.
+    """
     wholes = [each["whole"] for each in chosen]
     padded = {len(whole) for whole in wholes} == {max(2, len(wholes[0]))}
     return all(text[-1:].isalnum() for text in before) and (_mark(chosen[0]) in "mn" or (zero and padded))

@@ -33,9 +33,9 @@ def kinds_of(path: object, names: Sequence[str]) -> dict[str, FrameKind]:
     """The kind of each image of a scan. If there is only one series, it is the projections, whatever the sample is
     called.
 
-    Words for references (dark, flat, white, open beam; ob, df, dc as whole words) tell. If they leave no projection,
-    the sample is named by such a word: it is the one series with another word in its name, or the only series, or the
-    largest, where both kinds of references are there without it.
+    Words for darks and flats (dark, flat, white, open beam; ob, df, dc as whole words) decide. If they leave no
+    projection, the sample's name contains such a word: it is the one series with another word in its name, or the only
+    series, or the largest, if both kinds of references exist without it.
 
     Raises:
         DataError: no series can be recognised as the projections.
@@ -73,7 +73,7 @@ def _sample_of(series: dict[str, list[str]], kinds: dict[str, FrameKind]) -> str
 
 
 def _kind_of(name: str) -> FrameKind:
-    """The kind of image by a file's name relative to the scan's folder, which takes precedence over its folders."""
+    """The kind of image from a file's name relative to the scan's folder; the name has precedence over folders."""
     for words in (_REFERENCE, _SHORT):
         for part in reversed(name.lower().split("/")):
             match = words.search(part)
@@ -83,7 +83,7 @@ def _kind_of(name: str) -> FrameKind:
 
 
 def _without_common_folder(names: Sequence[str]) -> list[str]:
-    """Names relative to the deepest folder that holds them all: what it is called says nothing of one of them."""
+    """Names relative to the deepest folder that contains them all, because its name does not distinguish them."""
     parts = [name.split("/") for name in names]
     n = 0
     while parts and all(len(each) > n + 1 and each[n] == parts[0][n] for each in parts):
@@ -165,16 +165,17 @@ def in_order(path: object, images: Sequence[str], *, one_series: bool = False) -
 
 
 def _half_a_turn_on(series: list[str]) -> list[str]:
-    """Images in the one folder that is named after an angle of 180 degrees, or a whole one, beside all others."""
+    """Images in the one folder that is named after an angle of 180 or 360 degrees, next to all others."""
     stated = {name: _DEGREES.search(name.lower().rpartition("/")[0]) for name in series}
     named = [name for name, match in stated.items() if match and match[1] in ("180", "360")]
     return named if 2 * len(named) < len(series) and len(named) == sum(map(bool, stated.values())) else []
 
 
 def _places(path: object, stated: NamedAngles, images: Sequence[str], *, one_series: bool) -> NDArray[np.int64]:
-    """The number of each image of a series, by its name without an angle. DataError: there are several series.
+    """The number of each image of a series, from its name without an angle. Raises DataError if there are several
+    series.
 
-    Series of which each counts again follow one another, as where their names say of which kind they are.
+    Series with their own counts follow one another, for example if their names state their kinds.
 
     Args:
         images: of the scan, also those of other kinds.
@@ -202,14 +203,15 @@ def _rank(name: str) -> int:
 
 
 def _template(name: str, doubt: str = "") -> str:
-    """A name without its numbers; in doubt of their signs, without these."""
+    """A name without its numbers; if it is unclear whether a mark is a sign, without the mark."""
     return re.sub(r"[-+_\d]+" if doubt else r"\d+", "", name)
 
 
 def _numbers(names: Sequence[str]) -> NDArray[np.int64] | None:
-    """The number of each image, wherever it stands in the name; None if no number differs from name to name.
+    """The number of each image, at any place in the name; None if no number differs from name to name.
 
-    Of several that are, the one that counts most closely; others, such as a date, may only go along with it.
+    If several numbers differ, the one that counts most consecutively; others, such as a date, may only vary together
+    with it.
     """
     numbers = np.zeros(len(names), np.int64)
     of_template: dict[str, list[int]] = {}
