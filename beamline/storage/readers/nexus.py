@@ -39,7 +39,7 @@ class Places:
 
     @property
     def keys(self) -> h5py.Dataset:
-        """The codes of the kinds of frames; of two lists that which has alignment frames, too."""
+        """The codes of the kinds of frames; if there are two lists, the one that also has alignment frames."""
         return datasets.dataset(self.detector, "image_key_control") or self.image_key
 
     def kinds(self) -> NDArray[np.int32]:
@@ -107,10 +107,11 @@ def _find_angle(entry: h5py.Group, detector: h5py.Group, n: int) -> tuple[h5py.D
 
 
 def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
-    """The rotations with several angles that the sample depends on, and their sense: those that change, or all.
+    """The rotations with several angles that the sample depends on, and their sense: those that change, or else all.
 
-    The chain of NXtransformations begins at `sample/depends_on` and goes on by the attribute of each; a step may be a
-    group with a `value`, such as NXpositioner and NXlog. The sense is that of the longest component of the vector.
+    The chain of NXtransformations begins at `sample/depends_on` and continues with the attribute of each step; a step
+    may be a group with a `value`, such as NXpositioner and NXlog. The sense is that of the longest component of the
+    vector.
     """
     here, where, steps, rotations = (
         datasets.resolve(entry, "sample"),
@@ -133,7 +134,7 @@ def _rotations_of_sample(entry: h5py.Group) -> list[tuple[h5py.Dataset, int]]:
 def choose(file: h5py.File, found: list[Places], data: str | None = None) -> Places:
     """The one detector to read: the one whose frames are `data`, or the one named by `default` of file and entry.
 
-    DataError: there is none, or several fit.
+    Raises DataError if there is none, or if several fit.
     """
     if not found:
         raise DataError(f"{file.filename} has no NXdetector with frames [frame, row, col] and an image_key.")
@@ -177,10 +178,10 @@ class NexusGeometry:
 
     Attributes:
         pixel_mm: (width, height) of a pixel: at the sample, of a cone on the detector.
-        cone: mm from the source to the sample and to the detector; None also for a beam that is as good as parallel.
-        central_ray: (row, column) that it meets, counted as frames are read; NaN if it is not stated.
+        cone: mm from the source to the sample and to the detector; None also for a beam that is practically parallel.
+        central_ray: (row, column) where it meets the detector, counted as frames are read; NaN if it is not stated.
         mirrored: (rows, columns) of the frames are in reverse order.
-        turned: turns of the detector that are not used, as text; "" for none.
+        turned: rotations of the detector that are not used, as text; "" for none.
         remarks: sentences by name, for `info`.
     """
 
@@ -196,7 +197,7 @@ def read_geometry(places: Places) -> NexusGeometry:
     """The geometry of a file of another program.
 
     Raises:
-        DataError: distances that cannot be.
+        DataError: impossible distances.
     """
     detector, entry = places.detector, places.entry
     own = [datasets.scalar(detector, f"{side}_pixel_size", datasets.LENGTH_UNITS) for side in "xy"]
@@ -215,7 +216,7 @@ def read_geometry(places: Places) -> NexusGeometry:
 
 
 def _central(places: Places, along: int, pitch: float | None, reverse: bool) -> float:
-    """The pixel along x (0) or y (1) that the central ray meets, by a length or a number of pixels; NaN: not stated."""
+    """The pixel along x (0) or y (1) that the central ray meets, stated in mm or in pixels; NaN: not stated."""
     pixels = {"": 1.0, "px": 1.0, "pixel": 1.0}
     pixels |= {name: mm / pitch for name, mm in datasets.LENGTH_UNITS.items()} if pitch else {}
     at = datasets.scalar(places.detector, f"beam_center_{'xy'[along]}", pixels)
@@ -225,7 +226,7 @@ def _central(places: Places, along: int, pitch: float | None, reverse: bool) -> 
 def _cone_of(
     places: Places, own: float | None, at_sample: float | None
 ) -> tuple[tuple[float, float] | None, dict[str, str]]:
-    """The cone of `NexusGeometry`, and a remark on a beam that is as good as parallel; widths of a pixel in mm."""
+    """The cone of `NexusGeometry`, and a remark on a beam that is practically parallel; widths of a pixel in mm."""
     upstream, beyond = (
         _source_distance(places.entry),
         datasets.scalar(places.detector, "distance", datasets.LENGTH_UNITS),
@@ -304,7 +305,7 @@ def _energies(entry: h5py.Group, n: int) -> NDArray[np.float64] | None:
 
 
 def _source_distance(entry: h5py.Group) -> float | None:
-    """mm, negative before the sample, as NXsource has it; some write it without the sign."""
+    """mm, negative in front of the sample, as NXsource defines it; some programs write it without the sign."""
     instrument = datasets.resolve(entry, "instrument")
     for group in groups(instrument):
         if datasets.attribute(group, "NX_class") == "NXsource" or str(group.name).endswith("/source"):
@@ -357,7 +358,7 @@ def _flag(detector: h5py.Group, name: str) -> bool:
 
 
 def _direction(item: h5py.Dataset) -> int | None:
-    """Which of x, y, z the attribute `vector` runs along; None for none of them."""
+    """Which of x, y, z the attribute `vector` is parallel to; None if to none of them."""
     vector = np.ravel(np.asarray(item.attrs.get("vector", ())))
     if vector.dtype.kind not in "iuf":
         return None

@@ -55,10 +55,11 @@ class NexusSource(ScanSource):
     """A scan with the structure of NXtomo; see ScanSource."""
 
     def __init__(self, path: Path, file: h5py.File, own_angles: bool = True, data: str | None = None) -> None:
-        """Read the open file. `own_angles` False: the caller brings the angles, so the file's may be absent or without
+        """Read the open file. `own_angles` False: the caller supplies the angles, so the file need not have any, or no
         units.
 
-        `data` is where the frames are, of several detectors; None: of the only one, or the file's default.
+        `data`: where the frames are, if there are several detectors; None: those of the only one, or of the file's
+        default.
         """
         self.path, self._file, self._own_angles, self.n = path, file, own_angles, 0
         self._mirrored_by, self._remarks = (False, False), dict[str, str]()
@@ -77,10 +78,10 @@ class NexusSource(ScanSource):
         self._read_stated(found if data is None else [])
 
     def _read_stated(self, found: list[Places]) -> None:
-        """What the file states of the scan, and the state of its frames.
+        """What the file states about the scan, and the state of its frames.
 
         Args:
-            found: scans of the file, of which those that are not read are named.
+            found: scans in the file; those that are not read are reported.
         """
         geometry = read_geometry(self._places)
         self._mirrored_by, self._remarks, self.cone = geometry.mirrored, geometry.remarks, geometry.cone

@@ -25,8 +25,8 @@ _FEWEST = 2000  # pairs of pixels, from which a variance is known to 3 %
 
 
 def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
-    """A scan whose pixels without data are 0 in all frames, flats included, so that they are filled like unlit ones;
-    and whether it is one of counted photons, whose dark is 0 and absent.
+    """A scan whose pixels without data are 0 in all frames, also in flats, so that they are replaced like pixels
+    without beam; and True for counted photons, whose dark is 0 and absent.
     """
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
@@ -44,11 +44,12 @@ def marked_source(base: ScanSource, no_data: Mask) -> tuple[ScanSource, bool]:
 
 
 def no_data_of(source: ScanSource) -> Mask | None:
-    """bool [row, col], pixels without data by the file's mask, or at the maximum of their type in all frames.
+    """bool [row, col], pixels without data, from the file's mask, or because they are at the maximum of their type in
+    all frames.
 
-    Whole numbers alone have such marks: the largest of a type without a sign, and what is below 0 of the others. Types
-    of 8 and 16 bits may end by too much light, so that whole rows and columns alone are marks there, and nothing else
-    may be at the end. None if nothing is marked, or more than half.
+    Only integers have such markers: the largest value of an unsigned type, and values below 0 of the others. Types of 8
+    and 16 bits may also reach their end because of too much light; for these only whole rows and columns count as
+    markers, and no other pixel may be at the end. None if nothing is marked, or more than half.
     """
     if source.dtype.kind not in "iu":
         return None
@@ -78,17 +79,17 @@ def _ends(source: ScanSource) -> list[Mask]:
 
 
 def _end_in(source: ScanSource, row: int) -> Mask:
-    """Where one frame is at the end of its type; it is read in two halves, so that no more memory is taken."""
+    """Where one frame is at the end of its type; it is read in two halves, so that no more memory is needed."""
     half = source.shape[0] // 2
     parts = (read_known(source, [row], rows)[0] for rows in (slice(0, half), slice(half, source.shape[0])))
     return np.concatenate([part < 0 if part.dtype.kind == "i" else part == np.iinfo(part.dtype).max for part in parts])
 
 
 def counts_photons(source: ScanSource) -> bool:
-    """Whether flats fluctuate like counted photons: with the variance of their mean, so that they have no offset.
+    """True if flats fluctuate like counted photons, with the variance of their mean, so that they have no offset.
 
-    Of a camera the variance over the mean is its gain, times the share of the light in its counts, which is less where
-    there is less light, as in dark corners: both halves of the pixels must agree.
+    For a camera, variance over mean is its gain times the share of the light in its counts. That share is smaller where
+    there is less light, as in dark corners; so both halves of the pixels must agree.
     """
     rows = source.table.flats[: 2 * _LOOKED_AT]
     if rows.size < 2 or source.dtype.kind not in "iu":

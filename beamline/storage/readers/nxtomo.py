@@ -26,7 +26,9 @@ from beamline.storage.writers.rows import RUNNING, ScanEnding, ending_in
 
 
 class OwnScan(NexusSource):
-    """A scan file of ours: the frames that its writer has counted, with their log, checksums and flags."""
+    """A scan file of this program: the frames that its writer has marked as complete, with their log, checksums and
+    flags.
+    """
 
     def _read_stated(self, found: list[Places]) -> None:
         self._damaged: set[int] = set()
@@ -67,8 +69,9 @@ class OwnScan(NexusSource):
         return n
 
     def _committed(self) -> int:
-        """The frames that the writer of our file counts; where they are more than before, their pixels are read
-        again."""
+        """The number of frames that the writer of the file has marked as complete; if it has grown, their pixels are
+        read again.
+        """
         committed = self._file[layout.COMMITTED]
         hdf5.look_again(committed)
         n = int(committed[()])
@@ -134,7 +137,7 @@ class OwnScan(NexusSource):
 
 
 def open_nxtomo(path: Path, *, follow: bool = False, own_angles: bool = True, data: str | None = None) -> NexusSource:
-    """The scan in an open file; arguments as of `NexusSource`."""
+    """The scan in an open file; arguments as for `NexusSource`."""
     file = hdf5.open_hdf5(path, follow)
     with hdf5.closed_on_error(file):
         return (OwnScan if layout.COMMITTED in file else NexusSource)(path, file, own_angles, data)

@@ -85,29 +85,31 @@ class SourceOptions:
             .txrm, the folder of a scene of R²-Gaussian.
         quantity: of the pixels, if the file does not state it; transmission (0 to 1) becomes counts with flats of 1 and
             darks of 0.
-        angles: replace the file's: a file in degrees (a text with one a line, a table with a column named so, .npy), a
-            list in an HDF5 file by its unit, FILE::NAME of one of several, or an array in radians; one angle for each
-            projection, one for each frame where the order of all frames is known, or one for each number of a series
-            of files, from its first to its last.
-        angle_rows: "a:b", which rows of these angles (or of the angle file beside a TIFF series) are those of the
+        angles: replace the file's. A file in degrees (a text with one per line, a table with a column for angles,
+            .npy), a list with a unit in an HDF5 file (FILE::NAME if there are several), or an array in radians. One
+            angle for each projection; or one for each frame, if the order of all frames is known; or one for each
+            number of a series of files, from its first to its last.
+        angle_rows: "a:b", which rows of these angles (or of the angle file next to a TIFF series) are those of the
             projections.
-        darks, flats: replace the file's; they come before its frames. An array, TIFFs, or an HDF5 file of their own
-            (FILE::DATASET where it has several).
-        data_path: of an HDF5 file of any layout: where its projections [frame, row, col] are; of an NXtomo with several
+        darks, flats: replace the file's; they come before its frames. An array, TIFFs, or a separate HDF5 file
+            (FILE::DATASET if it has several).
+        data_path: in an HDF5 file of any layout: where its projections [frame, row, col] are; in an NXtomo with several
             detectors: where the frames of one are.
         darks_path, flats_path: for `data_path`: where its darks and flats are.
-        angles_path: of any HDF5 file: where the angles are, instead of `angles`.
-        angles_unit: "deg" or "rad", of these or of `angles`, instead of what the file says.
+        angles_path: in any HDF5 file: where the angles are, instead of `angles`.
+        angles_unit: "deg" or "rad", of these or of `angles`, instead of the unit that the file states.
         order: of the dimensions of the projections, such as "row,view,col" for a stack of sinograms, or "view,col" for
-            one; of images in files one after the other, too.
-        earlier: files of the same scan, which have ended; their frames come before those of `path`.
-        horizontal_axis: the rotation axis lies along the rows: frames are turned by a quarter turn.
-        frames: "darks=0:5,flats=5:10": of which kind frames are, by their rows; all others are projections. Names of
-            files in a folder then say no kinds. "0::2": every second projection, as `transforms.selected` says.
+            one sinogram; also for a series of image files.
+        earlier: finished files of the same scan; their frames come before those of `path`.
+        horizontal_axis: the rotation axis is parallel to the rows: frames are rotated by 90 degrees.
+        frames: "darks=0:5,flats=5:10": the kind of frames, by their rows; all others are projections. Names of files in
+            a folder are then not used for that. "0::2": every second projection, see `transforms.selected`.
         then: further files of the same scan, whose frames follow.
-        side_file: of the scanner's maker: distances, pixel size, angles and white level, see `side_files`.
+        side_file: settings file of the scanner's maker: distances, pixel size, angles and white level, see
+            `side_files`.
         cols: (first, end) columns of the detector; the scan is read as if it had no others.
-        frames_per_view: consecutive projections that are averaged to one; None: as many as the plan in the file says.
+        frames_per_view: consecutive projections that are averaged to one; None: the number that the plan in the file
+            states.
     """
 
     path: Path | str
@@ -132,7 +134,7 @@ class SourceOptions:
 
     @property
     def stated(self) -> bool:
-        """True if the caller says more of the scan than its path: then it is no volume."""
+        """True if the caller states more about the scan than its path: then it cannot be a volume."""
         return any(getattr(self, field.name) is not field.default for field in fields(self)[1:])
 
     def open(self, *, follow: bool = False) -> ScanSource:
@@ -148,9 +150,10 @@ def open_scan(scan: SourceOptions | Path | str, *, follow: bool = False) -> Scan
         follow: the file may still be growing; refresh() then finds new frames.
 
     Raises:
-        DataError: not there, not a format that we read, or not consistent; the message says what was found.
-        ConfigError: columns outside the detector; a number of frames a projection that is less than 1.
-        NotReadyError (a DataError, `follow` only): the file is not there yet or just being created; try again.
+        DataError: the file does not exist, has no supported format, or is not consistent; the message says what was
+            found.
+        ConfigError: columns outside the detector; a number of frames per projection that is less than 1.
+        NotReadyError (a DataError, `follow` only): the file does not exist yet or is just being created; try again.
     """
     options = scan if isinstance(scan, SourceOptions) else SourceOptions(scan)
     path = Path(options.path)
@@ -256,7 +259,7 @@ def _with_references(base: ScanSource, options: SourceOptions, side: SideFile | 
 def _angle_table(
     options: SourceOptions, base: ScanSource, side: SideFile | None
 ) -> tuple[NDArray[np.float64] | None, str]:
-    """The angles that are given or stand beside a TIFF series, and where they come from; None: the scan's own."""
+    """The angles that are given, or that lie next to a TIFF series, and where they come from; None: the scan's own."""
     table = None if options.angles is None else load_angles(options.angles, options.angles_unit)
     origin = str(options.angles) if isinstance(options.angles, Path | str) else "The array of angles"
     if options.angles_path is not None:
@@ -292,8 +295,8 @@ def _at_data_path(path: Path, data: str, options: SourceOptions) -> ScanSource:
 
 
 def _true_type(source: ScanSource) -> np.dtype[Any] | None:
-    """The type that pixels really have: reals stored as whole numbers, or unsigned counts that wrapped, wide enough for
-    all of them; None: as stored.
+    """The type that pixels really have: real numbers stored as integers, or unsigned counts that overflowed, wide
+    enough for all of them; None: as stored.
     """
     if source.dtype.kind == "u":
         some = [each for each in _some_of_each_kind(source) if each.any()]

@@ -50,10 +50,10 @@ def stated_references(
 
     Args:
         given: by the caller.
-        white: counts of the open beam by the maker's file.
+        white: counts of the open beam from the maker's file.
 
     Raises:
-        DataError: what is no transmission.
+        DataError: the pixels cannot be transmission.
     """
     darks, flats = given
     nothing = np.zeros((1, *base.shape), base.dtype)
@@ -81,17 +81,17 @@ _LISTED = 8  # datasets that an error names
 
 
 def load_images(images: Images, kind: FrameKind, shape: tuple[int, int] | None = None) -> NDArray[Any]:
-    """Read reference frames [frame, row, col] into memory.
+    """Read darks or flats [frame, row, col] into memory.
 
-    In an HDF5 file they are the dataset that is named, or the frames of this kind by its image_key, or those of Data
-    Exchange, or the only images of this shape.
+    In an HDF5 file these are the dataset that is named, or the frames of this kind according to its image_key, or those
+    of Data Exchange, or the only images of this shape.
 
     Args:
         kind: DARK or FLAT.
         shape: (rows, cols) of the scan's frames; None: any.
 
     Raises:
-        DataError: they cannot be read, are no images, or several could be meant.
+        DataError: they cannot be read, are not images, or several could be meant.
     """
     if not isinstance(images, Path | str):
         return _stack(np.asarray(images), "The array of reference frames")
@@ -182,8 +182,11 @@ def _numbered(file: h5py.File, kind: FrameKind, shape: tuple[int, int] | None) -
 
 
 def places_of_flats(images: Images | None, shape: tuple[int, int], n: int) -> NDArray[np.float64] | None:
-    """Where in a scan of n frames, from its first (0) to its last (1), each of the flats in a file was taken; None: it
-    does not say. Numbers beyond n count other frames, too: then the first flat is at the first frame."""
+    """Where in a scan of n frames, from its first (0) to its last (1), each of the flats in a file was taken; None: not
+    stated.
+
+    If numbers exceed n, they also count other frames: then the first flat is assumed at the first frame.
+    """
     if not isinstance(images, Path | str) or not Path(images).is_file() or not hdf5.is_hdf5(Path(images)):
         return None
     with hdf5.open_hdf5(Path(images)) as file, hdf5.readable(Path(images)):

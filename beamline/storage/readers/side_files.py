@@ -35,13 +35,13 @@ class MakerKeys:
 
     Attributes:
         sod, sdd: distances from the source to the axis and to the detector, mm.
-        pixel: width of a pixel in mm, times `unit`; at the sample where `at_sample`.
+        pixel: width of a pixel in mm, times `unit`; at the sample if `at_sample`.
         count: of the projections.
-        step, span: degrees from one to the next, or of all.
-        first, last: degrees of the first one, and of the last.
+        step, span: degrees between two projections, or of all.
+        first, last: degrees of the first projection, and of the last.
         white: counts of the open beam.
         scale: a factor of both distances.
-        helix: keys that say "true" where the source goes round on another path than a circle.
+        helix: keys that are "true" if the source moves on another path than a circle.
     """
 
     maker: str
@@ -166,7 +166,9 @@ def read_side_file(path: Path) -> SideFile:
 
 
 def side_of(source: ScanSource) -> SideFile | None:
-    """The vendor's file in or beside a folder of images, or a TIFF, if exactly one has as many projections."""
+    """The vendor's file in a folder of images, or next to it or to a TIFF, if exactly one has the same number of
+    projections.
+    """
     if not source.format.startswith("tiff"):
         return None
     views, found = source.table.views.size, []
@@ -222,7 +224,7 @@ def _values(path: Path) -> dict[str, str]:
 
 
 def _text(path: Path) -> str:
-    """The content of a small file; its numbers and keys also where a program of Windows wrote its own characters."""
+    """The content of a small file; numbers and keys are also read if a Windows program wrote its own characters."""
     require_regular(path, SETTINGS)
     return decoded(path.read_bytes(), "replace")
 

@@ -77,7 +77,8 @@ class StacksSource(ScanSource):
 
     def number_frames(self, sizes: Sequence[int]) -> None:
         """Number the frames of stacks of these sizes, new ones after those known so far; angles and exposures become
-        NaN."""
+        NaN.
+        """
         had = np.bincount(self.rows[:, 0], minlength=len(sizes))
         new = [(stack, place) for stack, n in enumerate(sizes) for place in range(had[stack], n)]
         self.rows = np.r_[self.rows, np.array(new, np.int64).reshape(-1, 2)]
@@ -170,7 +171,7 @@ def open_stacks(
 
 
 def _take_angles(source: StacksSource, lists: list[NamedArray]) -> None:
-    """Take the one list that is named so, in the unit that it states, or in which it goes round 180 degrees or one."""
+    """Use the one list with a name for angles, in the unit that it states, or in which it covers 180 or 360 degrees."""
     if len(lists) != 1:
         return
     item, values, turns = lists[0], np.unique(lists[0][...]), {"rad": 2 * np.pi, "deg": 360.0}

@@ -60,7 +60,7 @@ def is_hidden(name: str) -> bool:
 
 
 def open_tiff(file: Path | IO[bytes]) -> tifffile.TiffFile:
-    """A TIFF and the pages in it: where it is one of a set, its metadata list the pages of all files."""
+    """A TIFF and the pages in it. If it is one file of a set, its metadata list the pages of all files."""
     if isinstance(file, Path):
         require_regular(file)
     return tifffile.TiffFile(file, is_ome=False, is_mmstack=False, is_ndtiff=False)
@@ -69,8 +69,8 @@ def open_tiff(file: Path | IO[bytes]) -> tifffile.TiffFile:
 def images_of(tif: tifffile.TiffFile) -> list[tifffile.TiffPageSeries]:
     """Groups of pages of one shape and type, without copies of reduced resolution, masks, and thumbnails.
 
-    Pages that tifffile wrote are taken as pages, whether they were written together or appended, unless the file says
-    that it has a header for the first alone.
+    Pages that tifffile wrote are used as pages, whether they were written together or appended, unless the file states
+    that only its first page has a header.
     """
     tif.is_shaped = tif.is_shaped and '"truncated": true' in tif.pages.first.description
     return [part for part in tif.series if not part.keyframe.subfiletype & _NO_IMAGE] or [*tif.series]
@@ -99,8 +99,7 @@ def stated(path: Path, tif: tifffile.TiffFile) -> tuple[NotUsed, ...]:
     """The images of a TIFF that are not used: copies, and those of other files.
 
     Raises:
-        DataError: its OME metadata say that pages go along several axes, which of them the projections are is not
-            known.
+        DataError: its OME metadata state several axes, and it is not known which of them is that of the projections.
     """
     listed, why = 0, "the full-resolution images of this file are used as frames"
     for pixels in re.findall(r"<Pixels\b[^>]*>", tif.pages.first.description):

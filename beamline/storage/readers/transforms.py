@@ -23,8 +23,10 @@ UNPACKED, _READ = 2**28, 2**30  # bytes of a frame in a file, and of those read 
 
 
 def brief_source(base: ScanSource, over: Callable[[], bool]) -> ScanSource:
-    """The scan for callers that only describe it: TakesTooLongError where `over` returns True before a read, or a read
-    would take long or much memory. The order of dimensions or the chunks of a file can make any frame cost all of it.
+    """The scan for callers that only describe it: raises TakesTooLongError if `over` returns True before a read, or if
+    a read would need much time or memory.
+
+    The order of dimensions or the chunks of a file can make reading any frame as expensive as reading all.
     """
 
     def pixels(read: Read, frames: slice | ArrayLike, rows: slice) -> NDArray[Any]:
@@ -75,9 +77,9 @@ _TURNED = (
 
 
 def turned(base: ScanSource) -> ScanSource:
-    """A scan with its frames rotated by a quarter turn: a horizontal rotation axis becomes vertical.
+    """A scan with its frames rotated by 90 degrees: a horizontal rotation axis becomes vertical.
 
-    What was the last column is the first row. Any rows take reading whole frames.
+    The last column becomes the first row. Reading any rows requires reading whole frames.
 
     Raises:
         DataError: a scan with flags, which has a vertical axis.
@@ -101,15 +103,15 @@ def turned(base: ScanSource) -> ScanSource:
 
 
 def with_kinds(base: ScanSource, kinds: str) -> ScanSource:
-    """A scan whose kinds of frames are assigned by the caller, or which has only the frames of one energy.
+    """A scan whose kinds of frames the caller states, or which has only the frames of one energy.
 
     Args:
-        kinds: such as "darks=0:5,flats=5:10+95:100,views=10:95", rows of the scan, ends not included. Without
-            projections all other frames are projections, else invalid. "none=30:38" alone makes these invalid, and
-            others stay. "energy=20" makes frames of other energies invalid, by the file.
+        kinds: such as "darks=0:5,flats=5:10+95:100,views=10:95", rows of the scan, ends not included. Without "views"
+            all other frames are projections, with it they are invalid. "none=30:38" alone makes these invalid, and the
+            others keep their kind. "energy=20" makes frames of other energies invalid, according to the file.
 
     Raises:
-        DataError: they are no such text, lie outside the scan, or the file states no such energy.
+        DataError: the text is wrong, rows are outside the scan, or the file states no such energy.
     """
     words, own = [word.strip() for word in kinds.split(",")], dict[str, Any]()
     named = [word for word in words if not word.startswith(_ENERGY)]
@@ -136,8 +138,8 @@ def kinds_and_views(frames: str | None) -> tuple[str | None, slice | None]:
 def selected(base: ScanSource, views: slice) -> ScanSource:
     """Some projections of a scan, counted from 0 without darks and flats; the others are invalid frames.
 
-    Where the number of darks (flats) is a multiple of the step, they were taken in turn as the projections were, so
-    that those of the same turn are selected, counted from 0, too. Else all of them are.
+    If the number of darks (flats) is a multiple of the step, they were taken in turn like the projections, so those of
+    the same turn are selected, also counted from 0. Otherwise all of them are used.
 
     Raises:
         DataError: no projection is left.
@@ -156,12 +158,12 @@ def selected(base: ScanSource, views: slice) -> ScanSource:
 
 
 def only_left_out(kinds: str | None) -> bool:
-    """True if the caller says of no frame which kind it has, but of some that they are left out."""
+    """True if the caller states no kinds of frames, only that some are left out."""
     return kinds is not None and all(word.strip().startswith(("none=", _ENERGY)) for word in kinds.split(","))
 
 
 def _stated_keys(kinds: str, known: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The kind of each frame by what the caller says, or by what is known where he says only which are left out."""
+    """The kind of each frame from the caller, or the known kinds if the caller only leaves frames out."""
     stated, named = np.full(known.size, -1), _ranges(kinds, known.size)
     for kind, first, end in named:
         if (stated[first:end] >= 0).any():
@@ -250,10 +252,10 @@ def unsigned(images: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
 
 
 def real_type(images: NDArray[Any]) -> np.dtype[Any] | None:
-    """The real type of whole numbers [..., col] that are the bits of real ones; None if they are whole.
+    """The real type of integers [..., col] that are the bits of real numbers; None if they are integers.
 
-    Real numbers of one quantity lie close together by their bits. Whole numbers would do so only if nearly all of them
-    lay within four per cent of the range of their type, around a quarter or three quarters of it.
+    Real numbers of one quantity are close together in their bits. Integers would be so only if nearly all of them were
+    within four per cent of the range of their type, around a quarter or three quarters of it.
     """
     size = images.dtype.itemsize
     if images.dtype.kind != "u" or size < 4 or images.shape[-1] < 2:
@@ -276,10 +278,10 @@ def type_wrapped(images: NDArray[Any]) -> np.dtype[Any] | None:
     """The unsigned type for signed integers [..., col] in which the sign bit belongs to the count; None if they are
     signed.
 
-    Images are smooth: where counts pass the end of the signed type, neighbours differ by all of its range, and read
-    without a sign they do not. Counts that are all beyond the end are negative, which no light is. What is negative by
-    noise around 0, or marks pixels without data by one value, has not wrapped. Four bytes may hold those of two, where
-    a file has projections as int16 beside flats as uint16.
+    Images are smooth: where counts pass the end of the signed type, neighbours differ by its whole range, but not if
+    they are read without a sign. Counts that are all beyond the end are negative, which light cannot be. Values that
+    are negative because of noise around 0, or that mark pixels without data by one value, have not overflowed. Four
+    bytes may contain values of two, if a file has projections as int16 next to flats as uint16.
     """
     if images.dtype.kind != "i" or images.dtype.itemsize > 4 or images.shape[-1] < 2:
         return None
@@ -302,12 +304,12 @@ _SMOOTH = 3.0  # times the least change beside an edge: the step across the end,
 
 
 def wrapped_edges(images: NDArray[Any], dtype: np.dtype[Any], flat: NDArray[Any] | None = None) -> int:
-    """Edges of counts [..., col] of 16 bits from one end of the range to the other, which no optics makes.
+    """Number of edges in counts [..., col] of 16 bits from one end of the range to the other, which no optics makes.
 
-    Two pixels on either side lie in their half of the range, which one that is hot or was hit has not. Where nearly all
-    at the top have one value, light was cut off there. 0 for fewer than one in ten rows has. Where a `flat` [..., col]
-    is near the top on both sides, something opaque has such an edge, unless the step across the end is as those beside
-    it.
+    Two pixels on either side must be in their half of the range, which is not so for a hot pixel or a zinger. If nearly
+    all at the top have one value, the light was cut off (saturation). 0 if fewer than one in ten rows has such an edge.
+    If a `flat` [..., col] is near the top on both sides, something opaque makes such an edge, unless the step across
+    the end is as smooth as its surroundings.
     """
     if dtype.kind not in "iu" or dtype.itemsize != 2 or images.shape[-1] < 4:
         return 0

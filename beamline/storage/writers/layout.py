@@ -9,8 +9,7 @@ frame and only grow afterwards.
       instrument/monochromator  NXmonochromator: energy (keV), where there is a monochromator
       sample                    name, rotation_angle (degree)
       data                      NXdata: hard links to data, rotation_angle, image_key (with @target); float axes y, x
-      frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; checksum: of
-      these,
+      frame_log                 kind, trigger, framestamp, time of each frame, the row it replaces; checksum: of these,
                                 of its angle, image key and count_time (record_checksums); its flags,
                                 flag_scores, flag_regions and frame_valid; flag_legend: bits of the flags
       digest                    statistics of each frame, and preview f32 [frame, row, col]
@@ -77,7 +76,7 @@ STATUS = "/entry/progress/status"
 MISSING = "/entry/progress/missing_triggers"
 REASON = "/entry/progress/reason"
 PASS_ENDS = "/entry/progress/pass_ends"  # rows; only of scans that decide what is measured after a pass
-DECISIONS = "/entry/progress/decisions"  # a line of JSON each, the values of the event `next_chosen`; in the same way
+DECISIONS = "/entry/progress/decisions"  # of such scans: a line of JSON each, the values of the event `next_chosen`
 PART_STARTS = "/entry/record/part_starts"
 EXCHANGE = "/exchange"
 PARTS = "/entry/record/parts"
@@ -121,7 +120,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = MappingProxyType(
 
 
 def growing(file: h5py.File) -> list[str]:
-    """What has a row for each frame in this file, beside the pixels and their preview."""
+    """The datasets with a row for each frame in this file, apart from the pixels and their preview."""
     return [*COLUMNS, VALID, SCORES, REGIONS, *(path for path in (X_TRANSLATION,) if path in file)]
 
 
@@ -142,16 +141,16 @@ class ScanInfo:
         pixel_size_mm: at the sample; energy_kev; distance_mm: sample to detector.
         exposure, period: s.
         axis_col: rotation axis in 0-based pixel-centre columns.
-        source_distance_mm: source to sample; given only where the beam is a cone (then `pixel_size_mm` is that on the
-            detector, as NXtomo has it).
+        source_distance_mm: source to sample; given only for a cone beam (then `pixel_size_mm` is that on the detector,
+            as in NXtomo).
         plan: JSON; config: YAML; both as text for the record.
         devices: the description of each device, by its name.
         filter: its place, by name.
-        monochromator_kev: at which it stands; `energy_kev` is the same then. None: there is none, or it is not known.
+        monochromator_kev: its present energy; `energy_kev` is then the same. None: there is none, or it is not known.
         beam_unit: of the beam monitor's readings; None: there is none.
         saturation: the count from which a pixel is saturated.
-        offset_views: whether some are planned.
-        decides: whether what is measured next is chosen after each pass.
+        offset_views: True if some are planned.
+        decides: True if what is measured next is chosen after each pass.
         diameter_mm: of the sample.
     """
 
@@ -325,7 +324,7 @@ def field_of_view(file: h5py.File) -> str:
 
 
 def _planned_angles(info: ScanInfo) -> NDArray[np.float64]:
-    """Angles of the planned projections, in radians; unknown where the plan does not say them."""
+    """Angles of the planned projections, in radians; unknown if the plan does not state them."""
     try:
         return np.radians(np.asarray(json.loads(info.plan)["angles_deg"], np.float64))
     except (ValueError, LookupError, TypeError):  # a plan of another program, or none
@@ -333,7 +332,7 @@ def _planned_angles(info: ScanInfo) -> NDArray[np.float64]:
 
 
 def _field_of_view(angles: NDArray[np.float64], frame_shape: tuple[int, ...], axis_col: float | None) -> str:
-    """`Half` where 360 degrees sees half of the sample at a time; "" where angles or the axis are not known."""
+    """`Half` if a 360-degree scan shows half of the sample at a time; "" if angles or the axis are not known."""
     if not np.isfinite(angles).all():
         return ""
     if angles.size < 2 or np.ptp(angles) * angles.size / (angles.size - 1) < 2 * np.pi - _TURN_TOLERANCE:

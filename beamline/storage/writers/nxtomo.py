@@ -173,8 +173,8 @@ class NXtomoWriter:
 
     @property
     def safe(self) -> int:
-        """Committed frames that are known to be on the disk: after a failed fsync all since the last successful one may
-        be lost.
+        """Committed frames that are known to be on the disk: after a failed fsync, all since the last successful one
+        may be lost.
         """
         return self._to_disk.rows if self._to_disk.failed else self._committed
 
@@ -198,7 +198,7 @@ class NXtomoWriter:
         self._append_last(layout.PASS_ENDS, self._rows, "the end of a pass")
 
     def add_decision(self, values: Mapping[str, object]) -> None:
-        """Record what was chosen after a pass, in the same way."""
+        """Record what was chosen after a pass, in a file made for it (ScanInfo.decides); errors as in `end_pass`."""
         self._append_last(layout.DECISIONS, json_of(values).encode(), "a decision")
 
     def _append_last(self, path: str, value: int | bytes, what: str) -> None:
@@ -286,9 +286,9 @@ class NXtomoWriter:
             raise
 
     def _let_go(self, reason: str) -> None:
-        """Mark the end where there is room for it already, and leave the rest as a dead writer would.
+        """Mark the end where space was already reserved for it, and leave the rest as a killed process would.
 
-        Readers see every frame committed.
+        Readers see every committed frame.
         """
         try:
             state_words(self._last, ScanEnding("failed", reason=reason))
@@ -339,8 +339,10 @@ class NXtomoWriter:
         )
 
     def _put_exchange_view(self) -> None:
-        """Add the /exchange view, which SWMR writing cannot, as it creates datasets; no frame depends on it."""
-        if hdf5.grows_here(self.path):  # where h5py has it open, HDF5 would cut the projection off when that is closed
+        """Add the /exchange view. This is impossible while writing SWMR, because it creates datasets; no frame depends
+        on it.
+        """
+        if hdf5.grows_here(self.path):  # where h5py has it open, HDF5 would cut the view off when that is closed
             self.remarks.append(
                 f"{self.path} has no /exchange view, because this program has the file open with h5py. "
                 "Close it there; then `beamline recover` adds the view."

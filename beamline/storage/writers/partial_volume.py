@@ -44,7 +44,7 @@ class PartialVolume:
     Attributes:
         slabs: all of them.
         made_from: data and settings, by name; the slabs to come must be made from the same.
-        kept: what else the slabs to come need, as JSON holds it.
+        kept: what else the slabs to come need, in a form that JSON can represent.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class PartialVolume:
         return self._maps["volume"]
 
     def has(self, n: int) -> bool:
-        """Whether slab n is finished."""
+        """True if slab n is finished."""
         return bool(self._maps["state"][n] == _DONE)
 
     @property
@@ -88,7 +88,7 @@ class PartialVolume:
         self._maps["done_text"][0] = f"{self.n_slices_done} of {len(volume)} slices"
 
     def _written(self, name: str) -> None:
-        """Return when it is on the disk: after a loss of power no slab counts that is not there."""
+        """Return when it is on the disk, so that after a loss of power no slab counts that is not there."""
         self._maps[name].flush()
 
     def _take_out(self) -> None:

@@ -143,15 +143,15 @@ def add_exchange_view(file: h5py.File) -> None:
 
 
 def has_exchange_view(file: h5py.File) -> bool:
-    """Whether /exchange is complete."""
+    """True if /exchange is complete."""
     return layout.EXCHANGE in file and set(_rows(file)) <= set(file[layout.EXCHANGE])
 
 
 def put_exchange_view(path: Path) -> None:
-    """Add the projection to a closed scan file. No block that frames hang on is written.
+    """Add the /exchange view to a closed scan file. No block on which frames depend is written.
 
     Raises:
-        DataError: the disk does not take it, or has less than ROOM free.
+        DataError: the disk fails, or has less than ROOM free.
     """
     if (free := shutil.disk_usage(path.parent).free) < ROOM:
         raise DataError(
@@ -166,7 +166,7 @@ def put_exchange_view(path: Path) -> None:
 
 
 def _rows(file: h5py.File) -> dict[str, I64]:
-    """Rows of each dataset of the projection."""
+    """Rows of each dataset of the /exchange view."""
     table = frames_in(file)
     rows = {name: table.of_kind(kind) for kind, name in NAMES.items()}
     return {name: rows_of_kind for name, rows_of_kind in rows.items() if rows_of_kind.size}
@@ -182,10 +182,10 @@ class ScanEnding:
     """How a scan ended.
 
     Attributes:
-        status: "complete", "stopped" (by the operator, an alarm, or references that cannot be used), "failed", or
-            RUNNING where nothing was stated.
+        status: "complete", "stopped" (by the operator, an alarm, or darks or flats that cannot be used), "failed", or
+            RUNNING if nothing was stated.
         missing: triggers that gave no frame, counted over the whole scan from 0.
-        reason: why it did not take all its frames, in words; "" where it did, or where nothing says it.
+        reason: why it did not take all its frames, in words; "" if it did, or if it is not stated.
     """
 
     status: str = "complete"

@@ -105,7 +105,9 @@ def open_txrm(path: Path, *, own_angles: bool = True) -> StacksSource:
 
 
 def _header(path: Path, file: TxrmFile) -> tuple[tuple[int, int, int], np.dtype[Any], int]:
-    """Images, rows and columns, the type of a pixel, and how many images were planned. DataError: they cannot be."""
+    """Images, rows and columns, the type of a pixel, and how many images were planned. Raises DataError if they are
+    impossible.
+    """
     info = {name: file.number(f"ImageInfo/{name}") for name in ("ImageHeight", "ImageWidth", "NoOfImages", "DataType")}
     lost = [name for name, value in info.items() if value is None]
     if lost:
