@@ -113,7 +113,7 @@ class _Frames(DetectorAcquireLogic):
             await self._task
 
     async def ensure_stopped(self) -> None:
-        """Stop, disarm, close shutter and file, with the sample back. Twice is once."""
+        """Stop, disarm, close shutter and file, with the sample back. A second call does nothing."""
         async with self._ending:
             self._stop.set()
             if self._task is not None:
@@ -123,8 +123,8 @@ class _Frames(DetectorAcquireLogic):
             self._task = None
 
     def _close(self, error: BaseException | None) -> None:
-        """Close shutter and file, and bring the sample back; the file says how many of the requested frames it lacks,
-        and why.
+        """Close shutter and file, and bring the sample back; the file states how many of the requested frames are
+        missing, and why.
         """
         writer, self._writer = self._writer, None
         if writer is not None:

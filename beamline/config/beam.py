@@ -22,7 +22,9 @@ Name = Annotated[str, Setting(min_length=1, max_length=80)]
 
 
 class MotorSection(Section):
-    """A separate motor, of any kind of stage. A linear axis has its own unit (mm, say) wherever a key says deg."""
+    """A separate motor, of any kind of stage. For a linear axis, every key with deg in its name means the axis's own
+    unit (such as mm).
+    """
 
     speed_deg_s: float | None = setting(None, "null: the stage's max_speed_deg_s.", gt=0)
     stage: Annotated[StageConfig, Field(discriminator="kind")]
@@ -85,7 +87,7 @@ class NoFilter(Section):
 
 
 class NamedFilter(Section):
-    """A filter that has only names: simulated without an effect on the light, or changed by the operator."""
+    """A filter that has only names: simulated without an effect on the intensity, or changed by the operator."""
 
     kind: Literal["simulated", "manual"]
     places: Annotated[tuple[Name, ...], Setting(min_length=1)]

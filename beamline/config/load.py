@@ -60,17 +60,17 @@ def load(
 ) -> Config:
     """Read and validate a configuration file.
 
-    Later wins: defaults, the file, BEAMLINE_SECTION__KEY variables, then `section.key=value` overrides. File names in
-    the file are relative to it; those in variables and overrides, to the working directory.
+    Later sources replace earlier ones: defaults, the file, BEAMLINE_SECTION__KEY variables, then `section.key=value`
+    overrides. File names in the file are relative to it; those in variables and overrides, to the working directory.
 
     Args:
-        environment: os.environ unless given.
-        rehearse: with the simulated counterpart of each device of a real instrument; see `rehearsal`.
-        no_live: given for a run without a reconstruction, whatever the file says; takes a sentence on what it then
-            does not do.
+        environment: default: os.environ.
+        rehearse: use the simulated counterpart of each device of a real instrument; see `rehearsal`.
+        no_live: given for a run without a live reconstruction, whatever the file states; takes a sentence on what the
+            run then does not do.
 
     Raises:
-        ConfigError: every fault with file, line, key, what was found and what is legal. Nothing has been started.
+        ConfigError: every fault with file, line, key, what was found and what is allowed. Nothing has been started.
     """
     path = Path(path)
     tree = _read_file(path, "beamline config init")
@@ -86,7 +86,7 @@ def load(
 
 
 def load_as(model: type[AnySection], path: Path, overrides: Iterable[str] = (), *, printed_by: str) -> AnySection:
-    """Read and validate a configuration of another package, as `load` does one of a scan; no variable overrides it.
+    """Read and validate a configuration of another package, as `load` reads that of a scan; no variable overrides it.
 
     Args:
         printed_by: the command that prints an example.
@@ -230,7 +230,7 @@ def scene_mapping(config: Config) -> dict[str, Any]:
     """The simulated scene as plain values, read from its file if the configuration names one.
 
     Raises:
-        ConfigError: the file is not there, or is no group of keys.
+        ConfigError: the file does not exist, or is not a group of keys.
     """
     scene = config.simulation.scene if config.simulation else {}
     if isinstance(scene, dict):
@@ -319,7 +319,7 @@ def _files(config: Config, shipped: Path) -> Iterator[tuple[tuple[str, ...], str
 
 
 def quantities(values: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float]]:
-    """Key path and value of each number of plain values; several ones of a key have its path."""
+    """Key path and value of each number in plain values; several numbers of one key share its path."""
     if isinstance(values, dict | list | tuple):
         for name, each in values.items() if isinstance(values, dict) else ((None, each) for each in values):
             yield from quantities(each, at if name is None else (*at, str(name)))
@@ -331,7 +331,7 @@ _ONE_FRAME_A_PULSE = {"trigger_mode": ("normal",), "trigger_times": (1,), "trigg
 
 
 def _triggers(config: Config) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Camera settings with which a fly scan's pulse does not give one frame of the planned exposure."""
+    """Faults of camera settings with which a fly scan's pulse does not give one frame of the planned exposure."""
     camera, stage, scan = config.devices.camera, config.devices.stage, config.scan
     if not isinstance(camera, DcamOrca) or scan.mode is not Mode.FLY:
         return
@@ -357,8 +357,9 @@ def camera_settings(config: Config, exposure: float, trigger: TriggerSource) -> 
 
 
 def offset_places(config: Config) -> tuple[float, ...]:
-    """The sample's places in mm for offset projections: by 0.9 of the field, until a twentieth of it shows air beyond
-    the sample on either side. ValueError: why it cannot be."""
+    """Positions of the sample in mm for offset projections: in steps of 0.9 of the field of view, until a twentieth of
+    it shows air beyond the sample on either side. Raises ValueError with the reason if this is impossible.
+    """
     mover, camera, diameter = config.devices.sample_mover, config.devices.camera, config.sample.diameter_mm
     if not config.scan.offset_views:
         return ()

@@ -113,7 +113,7 @@ class Fields(Section):
 
 
 class TargetSection(Section):
-    """What ends a scan that decides, whichever comes first; null: that does not end it."""
+    """When a scan that makes decisions ends; the first target that is reached counts; null: no such target."""
 
     quality_db: float | None = setting(
         None, "dB of PSNR that the volume may be worse than the volume of the whole plan.", gt=0, le=100

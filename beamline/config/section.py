@@ -26,9 +26,9 @@ Port = Annotated[str, Setting(min_length=1, problem=port_problem)]
 
 
 class Section(BaseModel):
-    """A frozen group of keys, which rejects unknown keys, and `yes` for a number.
+    """A frozen group of keys. It rejects unknown keys, and `yes` for a number.
 
-    What a validator of a group says begins with the key that is to be looked at, whose line the message then has.
+    The message of a validator of a group begins with the key that has the fault; the message then names its line.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -36,7 +36,7 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _refuse_yaml_traps(cls, data: Any) -> Any:
-        """Refuse what YAML reads otherwise than it was meant."""
+        """Raise an error for values that YAML reads differently from what the author probably meant."""
         for name, field in cls.model_fields.items() if isinstance(data, dict) else ():
             truths, value = (field.annotation, *get_args(field.annotation)), data.get(name)
             if isinstance(value, bool) and bool not in truths:

@@ -72,7 +72,7 @@ def read(text: str, name: str) -> Tree:
     """Parse YAML with safe types only.
 
     Raises:
-        ConfigError: bad syntax, a key said twice, or a top level that is no group of keys; with file and line.
+        ConfigError: bad syntax, a key given twice, or a top level that is not a group of keys; with file and line.
     """
     data, origins = _parsed(text, name)
     if data is None:
@@ -108,7 +108,9 @@ def _parsed(text: str, name: str) -> tuple[Any, dict[KeyPath, str]]:
 
 @contextmanager
 def yaml_faults(text: str, name: str) -> Iterator[None]:
-    """A context that reads YAML: ConfigError for its faults, and before for what would take longer than a second."""
+    """A context for reading YAML: raises ConfigError for its faults, and in advance for text that would take longer
+    than a second.
+    """
     depth = 0
     if len(text) > _LONGEST or _BRACKETS.search(text):
         raise ConfigError(f"{name}: {_TOO_MUCH}")
@@ -127,7 +129,7 @@ def yaml_faults(text: str, name: str) -> Iterator[None]:
 
 
 def _line_and_fault(error: Exception, text: str) -> tuple[int, str]:
-    """The line of a fault of YAML, 0: not known, and what is wrong with it, for who does not know YAML."""
+    """The line of a fault of YAML (0: not known), and what is wrong with it, for somebody who does not know YAML."""
     mark, context = getattr(error, "problem_mark", None), getattr(error, "context_mark", None)
     problem = str(getattr(error, "problem", None) or " ".join(str(error).split()) or type(error).__name__)
     if isinstance(error, yaml.reader.ReaderError):
@@ -200,11 +202,11 @@ def override(
 ) -> Tree:
     """The tree overridden by BEAMLINE_SECTION__KEY variables and then by `section.key=value`.
 
-    Values are YAML; those of text keys are the text as it stands, where it is not quoted as YAML. A variable without a
-    double underscore is ignored.
+    Values are YAML; values of text keys are used literally unless they are quoted as YAML. A variable without a double
+    underscore is ignored.
 
     Args:
-        is_text: whether the key of this path takes text.
+        is_text: True if the key of this path takes text.
 
     Raises:
         ConfigError: an override without `=`, or with a value that is not YAML.

@@ -38,7 +38,7 @@ def published(name: str, about: str, default: Any, unit: str = "") -> Any:
 class RunValues:
     """The current values of a run for control systems. Unknown numbers are NaN or -1.
 
-    Names that tomoscan (APS) has are as there.
+    Values that tomoscan (APS) also has have the same names.
     """
 
     run: str = published("Run", "folder of the run", "")
@@ -89,7 +89,7 @@ class RunValues:
 
 
 def choice_of(values: RunValues, word: str) -> Choice:
-    """The choice that an operator's word names. Raises ConfigError if it is not on offer."""
+    """The choice that an operator's word names. Raises ConfigError if it is not possible now."""
     if word in values.options and word in [*Choice]:  # a log of another version may have others
         return Choice(word)
     offer = f"possible: {', '.join(values.options)}" if values.options else "no pass has ended yet"
@@ -119,8 +119,8 @@ class StampedValues:
     """Values of a run, each with its stamp: of the event, or of the frame, that set it last.
 
     Attributes:
-        began: time of what nothing has set yet, s since the Unix epoch.
-        unread: why the file cannot be read any more, so that its values are old; "" where it can.
+        began: time of values that nothing has set yet, s since the Unix epoch.
+        unread: why the file can no longer be read, so that its values are old; "" if it can.
     """
 
     values: RunValues

@@ -122,10 +122,10 @@ class Recording:
         """Part of a frame, binned to a tile: counts, or transmission.
 
         Returns:
-            Values, the region that they show, and their binning. Where references are missing `corrected` gives counts.
+            Values, the region that they show, and their binning. Without darks and flats, `corrected` gives counts.
 
         Raises:
-            DataError: the file has no such frame, or does not give it.
+            DataError: the file does not have this frame, or it cannot be read.
         """
         frames = self.progress().frames
         if not 0 <= frame < frames:
@@ -201,5 +201,5 @@ def _foreign(path: Path) -> DataError:
 
 
 def _json_number(value: Any) -> float | None:
-    """The number; None for NaN and infinity, which have no place in JSON."""
+    """The number; None for NaN and infinity, which JSON cannot represent."""
     return float(value) if np.isfinite(value) else None

@@ -69,14 +69,15 @@ def watched(path: Path) -> Watched:
 
 
 def _joined(part: Path) -> Path:
-    """The file that joins a part of a run with the others, else its own."""
+    """The file that joins a part of a run with the others, otherwise its own file."""
     joined = joined_file_of(part / SCAN) if is_below(run_of(part), JOINED) else None
     return part / SCAN if joined is None else joined[0]
 
 
 class EventLog:
     """The events of a run as lines of JSON, numbered from 0 in the order of the file. An incomplete line comes with the
-    next call; one that is no event is skipped, and counted."""
+    next call; a line that is not an event is skipped, and counted.
+    """
 
     def __init__(self, folder: Path | None) -> None:
         self._folder, self._at, self._within = folder, 0, False

@@ -37,7 +37,7 @@ _MISSES = math.radians(2)  # by which a pair may miss 180 degrees
 
 
 class _OverFlats:
-    """Projections [view, row, col] as the share of the light that the sample lets through; as they are without flats.
+    """Projections [view, row, col] as transmission; without flats, as they are.
 
     Attributes:
         dark, flat: means [row, col] of the first darks and flats; None without.
@@ -122,7 +122,7 @@ class ShownScan:
         return mean
 
     def axis(self, row: int) -> dict[str, Any]:
-        """The axis of the file, or as one row shows it, in columns, and where it comes from; whether it may lean.
+        """The axis from the file, or found from one row, in columns; where it comes from; and True if it may be tilted.
 
         Raises:
             DataError: the projections cannot be corrected, or have no angles.
@@ -138,8 +138,7 @@ class ShownScan:
         return {"axis": round(axis, 2), "said": said, "leans": not is_cone}
 
     def fbp(self, row: int, axis_col: float, tilt_deg: float, region: TileRegion, *, fast: bool) -> VolumeTile:
-        """A part of the slice that a row shows, by FBP with this axis; `fast`: of fewer projections, with larger
-        voxels.
+        """A part of the FBP slice of one row with this axis; `fast`: from fewer projections, with larger voxels.
 
         Raises:
             DataError: as `axis`.

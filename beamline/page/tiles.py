@@ -63,7 +63,7 @@ def bin_mean(pixels: NDArray[Any], factors: tuple[int, int]) -> NDArray[np.float
 
 
 def lit(flat: NDArray[np.float32], dark: NDArray[np.float32] | float) -> NDArray[np.float32]:
-    """The flat with NaN if it has no light, as behind slits: ratios there are noise."""
+    """The flat with NaN in pixels without intensity, for example behind slits, because ratios there are noise."""
     light = flat - dark
     return np.where(light > UNLIT * np.nanpercentile(light, BRIGHT), flat, np.float32(np.nan))
 
@@ -96,7 +96,7 @@ def tile_of(values: Any, facts: dict[str, Any]) -> Response:
 
 
 class _Number(IntegerConvertor):
-    """A whole number in a path; one of more digits is none that anything here has."""
+    """An integer in a path; one with more digits cannot be the number of anything here."""
 
     regex = "[0-9]{1,9}"
 
