@@ -101,7 +101,7 @@ def refusal(settings: CameraSettings, model: str = MODEL) -> str:
     if settings.readout not in LINE_TIME:
         return unknown("readout", settings.readout, LINE_TIME)
     if settings.binning not in BINNINGS:
-        return f"binning {settings.binning} does not exist; allowed: {', '.join(map(str, BINNINGS))}"
+        return f"binning {settings.binning} does not exist; legal: {', '.join(map(str, BINNINGS))}"
     shortest = LINE_TIMES[model][settings.readout]
     if not shortest <= settings.exposure <= MAX_EXPOSURE:
         return f"exposure {settings.exposure:g} s is outside {shortest:g} ... {MAX_EXPOSURE:g} s ({settings.readout})"

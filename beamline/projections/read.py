@@ -218,8 +218,8 @@ class ViewReader:
             dark = frames[~alive]
             if rows is None:  # a band of rows does not show whether a projection is usable
                 self.warn(
-                    f"{dark.size} of {source.table.views.size} projections have no finite pixel and are "
-                    f"left out (first: frame {dark[0]})."
+                    f"{dark.size} of {source.table.views.size} projections {'has' if dark.size == 1 else 'have'} no "
+                    f"finite pixel and {'is' if dark.size == 1 else 'are'} left out (first: frame {dark[0]})."
                 )
             data, frames = data[alive], frames[alive]
         lit, part, used = np.ones(len(frames), np.bool_), self.filters.within(rows), self.references

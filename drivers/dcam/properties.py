@@ -119,8 +119,8 @@ class Properties:
             problem,
             request=f"{prop.name} = {value:g}",
             reply=reply,
-            expected=f"another value; allowed: {self._legal(prop)}",
-            advice="Choose one of the allowed values in the configuration",
+            expected=f"another value, legal: {self._legal(prop)}",
+            advice="Choose one of the legal values in the configuration",
             state=_STATE,
         )
 

@@ -123,7 +123,7 @@ class Ring:
             self._overrun_reported = True
             raise DeviceError(
                 self._device,
-                f"its ring buffer of {self._slots} frames was overrun and {lost} frames are lost: numbers "
+                f"its ring of {self._slots} frames was overrun and {lost} frames are lost: numbers "
                 f"{first} to {oldest - 1} of this run in the order of arrival",
                 expected="every frame to be read before the ring buffer overwrites it",
                 advice="Read frames faster, trigger more slowly, or give the ring buffer more memory",

@@ -124,8 +124,8 @@ def apply_settings(properties: Properties, device: str, settings: CameraSettings
         raise DeviceRefused(
             device,
             problem,
-            expected=f"another one; allowed: {', '.join(_READOUTS)}",
-            advice="Choose one of the allowed values in the configuration",
+            expected=f"another one, legal: {', '.join(_READOUTS)}",
+            advice="Choose one of the legal values in the configuration",
             state="Its settings were not changed",
         )
     # Sensor mode and speed first: they change the ranges of the others.

@@ -294,7 +294,7 @@ class SimulatedOrcaQuest:
             gone = [self._ring.popleft().framestamp for _ in range(over)]
             raise DeviceError(
                 self.name,
-                f"its ring buffer of {self._build.ring_frames} frames was overrun and {over} frames are "
+                f"its ring of {self._build.ring_frames} frames was overrun and {over} frames are "
                 f"lost: framestamps {gone}",
                 advice="Read frames faster, trigger more slowly, or use a larger ring buffer",
                 state="Later frames can still be read",

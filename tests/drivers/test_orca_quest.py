@@ -51,7 +51,7 @@ def test_binning_shrinks_the_frame_and_the_transfer_not_the_readout() -> None:
     ("changes", "problem"),
     [
         ({"readout": "fast"}, "'fast' is unknown; legal: standard, ultra_quiet, photon_number"),
-        ({"binning": 3}, "binning 3 does not exist; allowed: 1, 2, 4"),
+        ({"binning": 3}, "binning 3 does not exist; legal: 1, 2, 4"),
         ({"exposure": 1e-6}, "outside 7.2e-06"),
         ({"exposure": 1e-4, "readout": "ultra_quiet"}, "outside 0.0001728"),
         ({"exposure": 2000.0}, "1800 s"),

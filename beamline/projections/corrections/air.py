@@ -53,7 +53,7 @@ def _parts(text: str) -> tuple[Columns, Surface]:
         return "auto", int(match[1])
     if text not in _MODELS:
         raise ValueError(
-            f"--air {text!r} is unknown; expected auto, none, columns, LEFT,RIGHT (numbers of columns, "
+            f"{text!r} is unknown; expected auto, none, columns, LEFT,RIGHT (numbers of columns, "
             "e.g. 12,12) or surface:ORDER (0 to 3)"
         )
     return _MODELS[text]

@@ -44,7 +44,7 @@ def _tilt(text: str) -> float | str:
     except ValueError:
         number = math.nan
     if not abs(number) <= _MOST_TILT_DEG:
-        raise ValueError(f"--tilt {text!r} is wrong; expected auto, or degrees within {_MOST_TILT_DEG:g} of 0")
+        raise ValueError(f"{text!r} is wrong; expected auto, or degrees within {_MOST_TILT_DEG:g} of 0")
     return number
 
 

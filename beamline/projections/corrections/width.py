@@ -43,8 +43,7 @@ def _spread(text: str) -> str:
             blur = math.nan
         if not 0 < blur <= _MOST_PX:
             raise ValueError(
-                f"--ray-width {text!r} is unknown; expected none, pixel, or a blur of up to {_MOST_PX:g} "
-                "pixels, e.g. 0.7"
+                f"{text!r} is unknown; expected none, pixel, or a blur of up to {_MOST_PX:g} pixels, e.g. 0.7"
             )
     return text
 
@@ -60,8 +59,7 @@ def _arc(text: str) -> str:
             numbers = []
         if not (0 < len(numbers) <= 2 and all(abs(number) <= _MOST_DEG for number in numbers) and numbers[0] >= 0):
             raise ValueError(
-                f"--exposure-arc {text!r} is unknown; expected auto, none, or ARC[:READOUT] of 0 to "
-                f"{_MOST_DEG:g} degrees, e.g. 0.5"
+                f"{text!r} is unknown; expected auto, none, or ARC[:READOUT] of 0 to {_MOST_DEG:g} degrees, e.g. 0.5"
             )
     return text
 

@@ -65,11 +65,11 @@ def quantity_stated(scan: ScanEvidence) -> Iterator[Finding]:
     """The quantity of the pixels is known: a missing or a second logarithm ruins a volume unnoticed."""
     if scan.source.quantity == "unknown":
         note = scan.source.attributes.get("quantity")
-        note_text = "Nothing says" if note is None else f"The file contains only a remark ({str(note)[:80]!r})"
+        remark = "" if note is None else f"The file has only a remark ({str(note)[:80]!r}). "
         yield Finding(
             "error",
             "quantity",
-            f"{note_text} on whether pixels are counts, transmission or line integrals: give --quantity "
+            f"{remark}It is not stated whether pixels are counts, transmission or line integrals: give --quantity "
             "counts, --quantity transmission or --quantity line-integrals." + (f" {_FALLS}" if _falls(scan) else ""),
         )
 

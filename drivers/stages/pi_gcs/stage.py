@@ -90,7 +90,7 @@ class PiGcsStage(LineStage):
         status = self._axis.status()
         if homing and not status.homed:
             error = self._stopped_short(
-                "the reference move stopped before it was complete", status, "the reference found"
+                "the reference move stopped short", status, "the reference found"
             )
             self._searching = False
             raise error
@@ -160,7 +160,7 @@ class PiGcsStage(LineStage):
             reply=str(code),
             expected="an axis at rest",
             advice=f"{advice(code)}. Frames since then may have been taken at another angle",
-            state=f"This has moved nothing; the stage is at {self._travel.degrees(self._axis.counts())}",
+            state=f"Nothing has moved by this; the stage is at {self._travel.degrees(self._axis.counts())}",
         )
 
     def _send_stop(self, hard: bool) -> str:

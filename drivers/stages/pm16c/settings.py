@@ -28,7 +28,7 @@ class PulseWidths:
     def __post_init__(self) -> None:
         if self.chosen is not None and not self.allowed:
             raise ValueError(
-                f"the trigger output has no pulses of {self.chosen:g} s; allowed: "
+                f"the trigger output has no pulses of {self.chosen:g} s; legal: "
                 f"{', '.join(f'{w:g}' for w in MODES)} s"
             )
 

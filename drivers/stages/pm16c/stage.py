@@ -67,7 +67,7 @@ class HomeSearch:
         why = status.ending or ("stopped" if self._cancelled else "no reason given")
         return DeviceError(
             self._name,
-            f"the search for the home switch stopped before it was complete ({why})",
+            f"the search for the home switch stopped short ({why})",
             reply=status.raw,
             expected="to be on the home switch",
             advice="Check the switch and its settings on the controller's panel, then search again",

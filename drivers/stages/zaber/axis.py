@@ -299,7 +299,7 @@ class ZaberAxis:
                 request=words,
                 reply=reply.raw,
                 advice="Check the configuration against the device, and that no other program controls it",
-                state="The current move continues" if reply.busy else "This has moved nothing",
+                state="The current move continues" if reply.busy else "Nothing has moved by it",
             )
         return reply
 

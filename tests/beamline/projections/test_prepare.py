@@ -181,7 +181,7 @@ def test_a_doubtful_axis_is_used_aloud_unless_the_file_knows(monkeypatch: pytest
     source.axis_col = 20.5
     prepared, warnings = prepare(source, FOUND)
     assert prepared.axis_col == 20.5
-    assert any("the file's 20.50 is used" in text for text in warnings)
+    assert any("the file's column 20.50 is used" in text for text in warnings)
 
 
 def test_a_doubtful_axis_gives_way_to_one_that_views_held_out_confirm(monkeypatch: pytest.MonkeyPatch) -> None:

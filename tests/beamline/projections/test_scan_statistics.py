@@ -71,7 +71,7 @@ def test_photons_and_dose_follow_from_the_flats(tmp_path: Path) -> None:
     views = SCAN.angles.size
     assert (
         light
-        == f"{photons:.4g} photons per pixel and projection in the open beam, {photons * views:.4g} in {views} views"
+        == f"{photons:.4g} photons per pixel and projection in the open beam, {photons * views:.4g} in {views} projections"
     )
     expected = absorbed_dose("water", 20.0, photons * views / 0.002**2)
     assert dose.startswith(f"{expected:.4g} Gy absorbed in water at 20 keV")

@@ -87,7 +87,7 @@ def test_a_ring_current_that_nothing_corrects_is_told(radius: float, ring_curren
     source = scan(radius, current[:, None, None] / 200)
     source.state(currents=np.r_[np.full(10, 200.0), current])
     _, told = prepare(source, SELECTION.with_steps(Preparation(ring_current=ring_current)))
-    assert ["varies from 150 to 200, 33%" in line for line in told if "ring current" in line] == of_current
+    assert ["varies by 33% (from 150 to 200)" in line for line in told if "ring current" in line] == of_current
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ def test_what_is_left_out_and_what_weighs_half_is_told_in_a_line(tmp_path: Path)
     rays = found.ray_weights(3)
     assert rays is not None and rays.shape == (27, 2, 40) and (rays[24:] == 1).all()
     (line,) = told
-    assert line.startswith("Of 30 views 6 have an alarm and are left out (beam 6 alarm), 2 have a warning")
+    assert line.startswith("Of 30 projections, 6 have an alarm and are left out (beam 6 alarm), 2 have a warning")
     assert "(beam 2 warn). They leave 42° without a projection. --flags" in line  # six of them side by side, 6° apart
     assert (found.left_out, found.n_projections) == (6, 30)
 

@@ -122,7 +122,7 @@ def test_parts_that_are_not_joined_are_not_taken_for_the_scan(tmp_path: Path) ->
 
 
 def test_the_folder_of_a_run_is_its_volume(ended: Path) -> None:
-    with pytest.raises(DataError, match=r"has no volume .*`beamline recon .* makes one"):
+    with pytest.raises(DataError, match=r"has no volume .*`beamline recon .* makes it"):
         volume_file(ended)
     (ended / "recon.h5").touch()
     assert volume_file(ended) == ended / "recon.h5"

@@ -57,7 +57,7 @@ def test_values_that_are_the_bytes_of_another_file_and_claims_without_bytes(tmp_
     with h5py.File(path, "r+") as file:
         del file["entry/notes"]
         file.create_dataset("entry/notes", (2**31,), "u1", chunks=(2**31,), compression="gzip")
-    with pytest.raises(DataError, match=r"claims 2\.15 GB"):
+    with pytest.raises(DataError, match=r"states 2\.15 GB"):
         open_scan(path)
     with h5py.File(path, "r+") as file:  # a chunk of 512 MiB, of which the dataset shows ten values
         del file["entry/notes"]

@@ -121,7 +121,7 @@ def test_the_configured_serial_number_is_required(maker: str) -> None:
     serial = str(stage.describe()["serial"])
     stage.close()
     rig.open(serial=serial).close()
-    with pytest.raises(DeviceRefused, match=rf"another device answers.*{serial}.*42.*swapped.*Nothing has moved"):
+    with pytest.raises(DeviceRefused, match=rf"another device answered.*{serial}.*42.*swapped.*Nothing has moved"):
         rig.open(serial="42")
 
 

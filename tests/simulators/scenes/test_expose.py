@@ -155,7 +155,7 @@ def test_a_converter_of_ones_own_has_its_electrons_a_count() -> None:
 
 
 def test_what_cannot_be_is_refused() -> None:
-    with pytest.raises(IndexError, match=r"scan's 0 \.\.\. 10"):
+    with pytest.raises(IndexError, match=r"which has 0 \.\.\. 10"):
         _scan().frame(11)
     with pytest.raises(ValueError, match="got 0"):
         _scan(views=0)

@@ -89,7 +89,7 @@ def _with(**changes: Any) -> dict[str, Any]:
         (_with(phantom={"kind": "teapot"}), "scene.phantom: kind 'teapot' is unknown; legal: battery, solids"),
         (
             _with(phantom={"kind": "battery", "field_of_view": [1, 1], "fill": 0.9}),
-            "scene.phantom (battery): only",
+            "scene.phantom (battery): lower fill",
         ),
         (_with(phantom={"kind": "solids"}), "scene.phantom (solids).solids is missing; expected a list of"),
         (

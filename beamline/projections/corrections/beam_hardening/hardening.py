@@ -46,7 +46,7 @@ def _model(text: str) -> str | None:
     """`fit` or `material:beam`; None for "none"."""
     if text not in ("none", "fit") and not re.fullmatch(r"[^:]+:.+", text):
         raise ValueError(
-            f"--hardening {text!r} is unknown; expected none, fit or MATERIAL:BEAM (Al:60kV,Al=1 is a "
+            f"{text!r} is unknown; expected none, fit or MATERIAL:BEAM (Al:60kV,Al=1 is a "
             "tube behind 1 mm Al; or Al:FILE)"
         )
     return None if text == "none" else text

@@ -30,9 +30,7 @@ def _material(text: str) -> str | None:
     """The part after `paganin:`, or "auto"; None for "none"."""
     way, _, material = text.partition(":")
     if text not in ("none", _AUTO) and (way != "paganin" or not material):
-        raise ValueError(
-            f"--phase {text!r} is unknown; expected auto, none, paganin:RATIO (delta/beta) or paganin:MATERIAL"
-        )
+        raise ValueError(f"{text!r} is unknown; expected auto, none, paganin:RATIO (delta/beta) or paganin:MATERIAL")
     return _AUTO if text == _AUTO else material or None
 
 
@@ -43,7 +41,7 @@ def _unsharp(text: str) -> tuple[float, float]:
     except ValueError:
         sigma = weight = math.nan
     if not (0 < sigma < math.inf and 0 <= weight < math.inf):
-        raise ValueError(f"--unsharp {text!r} is wrong; expected SIGMA:WEIGHT with SIGMA > 0 in pixels, e.g. 1.5:2")
+        raise ValueError(f"{text!r} is wrong; expected SIGMA:WEIGHT with SIGMA > 0 in pixels, e.g. 1.5:2")
     return sigma, weight
 
 

@@ -122,13 +122,13 @@ def test_vectors_state_all_of_the_geometry(tmp_path: Path, cone: bool, selected:
     pixels = round(found.geometry.pixel_pitch / geometry.pixel_pitch)
     left = found.projections.data - shadow_of_pixels(found.geometry, pixels)
     assert np.abs(left).max() < 2e-3  # counts are rounded
-    assert found.done["poses"].sentence == f"Vectors of 40 views from {text} state the geometry."
+    assert found.done["poses"].sentence == f"The geometry comes from {text}: vectors of 40 projections."
 
 
 def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
     columns, cone = f"view,{VECTOR_COLUMNS.format('src')}", vectors_of(free(cone=True))
     file = table(tmp_path, columns, np.arange(N), *cone.T)
-    with pytest.raises(ConfigError, match=r"of a cone, and .* give --cone 10(\.\d+)?:15\."):
+    with pytest.raises(ConfigError, match=r"of a cone, but .* give --cone 10(\.\d+)?:15\."):
         prepared(path, file, axis_col=None)
     with pytest.raises(ConfigError, match=r"pixels of 60 um, .*of 40 um.*--pixel-size-um"):
         prepared(path, file, axis_col=None, cone=(10.0, 15.0))
@@ -206,7 +206,7 @@ def test_the_axis_is_found_with_the_shifts(tmp_path: Path) -> None:
 
 def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp_path: Path) -> None:
     head, columns = f"view,{COLUMNS}", (np.arange(N), *SHIFTS.T, *TURNS.T)
-    with pytest.raises(DataError, match=r"of 20 of.*frame 5, at 31.5 degrees.*--views"):
+    with pytest.raises(DataError, match=r"for 20 of.*frame 5, at 31.5 degrees.*--views"):
         prepared(path, table(tmp_path, head, *(column[::2] for column in columns)))
     found = prepared(path, table(tmp_path, head, *(column[:30] for column in columns)), views="first:20")
     assert found.geometry.n_views == 20 and found.held_out is not None and found.held_out.geometry.n_views <= 10
@@ -225,8 +225,8 @@ def test_poses_of_all_views_are_not_needed_where_some_are_chosen(path: Path, tmp
         ("view,shift_col_px\n0,\n", "'0,' are not 2 numbers"),
         ("view,shift_col_px\n0,nan\n", "view 0 has no finite shift"),
         ("view,shift_col_px\n0,1\n0,2\n", "view 0 has 2 rows"),
-        ("view,shift_col_px\n0.5,1\n", r"view holds \[0.5\]; expected whole numbers"),
-        ("view,shift_col_px\n-1,1\n", r"view holds \[-1.0\]; expected whole numbers"),
+        ("view,shift_col_px\n0.5,1\n", r"view holds \[0.5\]; expected integers"),
+        ("view,shift_col_px\n-1,1\n", r"view holds \[-1.0\]; expected integers"),
         ("angle_deg,roll_deg\ninf,1\n", r"angle_deg holds \[inf\]; expected finite angles"),
         ("view,tilt_deg\n3,86\n", "view 3 has a roll of 0 and a tilt of 86 degrees"),
     ],

@@ -84,7 +84,7 @@ def test_a_sinogram_is_said_to_be_one(tmp_path: Path, turned: bool, other: str) 
         sentences = list[str]()
         checked_views(evidence_of(source, Selection()), Selection().of(source), sentences.append)
     (said,) = [each for each in sentences if "sinogram" in each]
-    assert isinstance(said, Note) and "20 views and 9 columns" in said and other in said
+    assert isinstance(said, Note) and "20 projections and 9 columns" in said and other in said
 
 
 def test_a_sinogram_of_data_exchange_is_said_to_be_one(tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_a_sinogram_of_data_exchange_is_said_to_be_one(tmp_path: Path) -> None:
         file["exchange/data"], file["exchange/theta"] = VIEWS[:, 0].T.astype(np.uint16), np.arange(5) * 30
         file["exchange/data"].attrs["axes"] = "x:theta"
     (said,) = [each.message for each in validate(tmp_path / "s.h5") if each.rule == SINOGRAM]
-    assert "5 views and 4 columns" in said and "/exchange/data to theta:x" in said
+    assert "5 projections and 4 columns" in said and "/exchange/data to theta:x" in said
 
 
 @pytest.mark.parametrize("packed", [np.savez, np.savez_compressed])

@@ -185,7 +185,7 @@ def test_nikons_list_of_angles_goes_before_its_step(images: Path) -> None:
         ("s.xtekct", NIKON.replace("SrcToDetector", "Other"), "states no xtekct/srctodetector"),
         ("s.xtekct", NIKON.replace("=60\nSrc", "=-60\nSrc"), "states no xtekct/srctoobject"),
         ("s.xtekct", "no section\n", "cannot be read as a settings file of a CT scanner"),
-        ("s.xtekct", NIKON.replace(f"Projections={N}", "Projections=7"), "7 projections; .* has 6"),
+        ("s.xtekct", NIKON.replace(f"Projections={N}", "Projections=7"), "7 projections, but .* has 6"),
         ("diondo.xml", DIONDO.replace("HelixMode>false", "HelixMode>true"), "helixmode"),
         ("s.xml", "<a><b></a>", "cannot be read as a settings file of a CT scanner"),
         ("s.xml", '<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "defines XML entities"),

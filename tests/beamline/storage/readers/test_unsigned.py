@@ -82,6 +82,6 @@ def test_views_that_wrapped_beside_flats_of_another_type_are_read(tmp_path: Path
     flats[:, 0, 0] += 5
     changes = {"data": counts.view(np.int16), "data_white": flats.view(flats_as)}
     with open_scan(write_exchange(tmp_path / "s.h5", SCAN, changes)) as source:
-        assert source.dtype == np.uint16 and "wrapped" in str(source.attributes["pixels"])
+        assert source.dtype == np.uint16 and "overflowed" in str(source.attributes["pixels"])
         np.testing.assert_array_equal(source.read(source.table.views), counts)
         np.testing.assert_array_equal(source.read(source.table.flats), flats)

@@ -27,8 +27,8 @@ FRAMES = frames_of(TwoCylinders(angles=np.radians(np.arange(0, 180, 10.0))))  # 
             (
                 range(6, 9),
                 "warning",
-                "flagged 4 of 22 frames: beam 1 warn 3 alarm. Frames with an alarm: 6-8. A reconstruction (--flags "
-                "use): Of 18 views 3 have an alarm and are left out (beam 3 alarm)",
+                "flagged 4 of 22 frames: beam 1 warn 3 alarm. Frames with an alarm: 6-8. In a reconstruction (--flags "
+                "use): Of 18 projections, 3 have an alarm and are left out (beam 3 alarm)",
             ),
             (
                 range(6, 20),
@@ -59,7 +59,7 @@ IN_A_PART = (
     ("region", "said"),
     [
         ((0, 1, 4, 8), IN_A_PART),
-        (None, "Of 18 views 4 have an alarm and are left out (bands 4 alarm)."),
+        (None, "Of 18 projections, 4 have an alarm and are left out (bands 4 alarm)."),
     ],
 )
 def test_what_a_reconstruction_does_is_said_in_its_own_words(
@@ -71,6 +71,6 @@ def test_what_a_reconstruction_does_is_said_in_its_own_words(
     with open_scan(write_flagged(tmp_path / "s.h5", FRAMES, {})) as source:
         (finding,) = frames_flagged(ScanEvidence(source, EvidenceRequest(judged=judged)))
         taken = usable_views(ScanEvidence(source, EvidenceRequest(judged=judged)), True)
-    assert finding.message.endswith(f"A reconstruction (--flags use): {said}")
+    assert finding.message.endswith(f"In a reconstruction (--flags use): {said}")
     assert taken.sentence.startswith(said)
     assert taken.frames.size == 18 - taken.left_out == (18 if region else 14)

@@ -253,7 +253,7 @@ def test_a_file_that_another_program_touches_ends_the_scan(
     writer: NXtomoWriter, frames: list[Frame], touch: Callable[[Path], None], said: str, at: int
 ) -> None:
     """HDF5 writes on, so that nothing else tells: a cut file is a hole at its beginning, with the size that it had."""
-    with pytest.raises(DataError, match=f"was written:.*{said}"):
+    with pytest.raises(DataError, match=f"was writing it .*{said}"):
         for frame in frames:
             if frame.index == at:
                 touch(writer.path)

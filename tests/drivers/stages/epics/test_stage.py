@@ -82,7 +82,9 @@ def test_a_limit_switch_ends_the_move_with_its_name() -> None:
     _, url, clock = _record(switch_at=10_000)
     stage = _stage(url, clock)
     stage.start_move(math.radians(20), SPEED)
-    with pytest.raises(DeviceError, match=r"stopped short of 20.*Move it away.*is at 10.0000 deg.*upper limit switch"):
+    with pytest.raises(
+        DeviceError, match=r"stopped short of 20.*Move it away.*stands at 10.0000 deg.*upper limit switch"
+    ):
         stage.wait(60)
 
 
@@ -158,7 +160,7 @@ def test_what_ends_a_move_on_the_way_is_named_and_stands_is_said_of_what_was_see
     stage.start_move(math.radians(20), SPEED)
     clock.sleep(0.5)
     act(record)
-    with pytest.raises(DeviceError, match=rf"stopped short of 20.*It is at .*{said}"):
+    with pytest.raises(DeviceError, match=rf"stopped short of 20.*It stands at .*{said}"):
         stage.wait(60)
     before = record.motor.position()
     clock.sleep(10)

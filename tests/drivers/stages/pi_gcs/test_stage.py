@@ -117,7 +117,7 @@ def test_a_search_that_fails_says_so_and_leaves_the_axis_unreferenced() -> None:
     rig = Rig(reference_fails=True, found_at=3.0)
     stage = rig.open()
     stage.start_home()
-    with pytest.raises(DeviceError, match=r"error 45.*of the reference"):
+    with pytest.raises(DeviceError, match=r"error 45.*from the reference"):
         stage.wait(LONG)
 
 
@@ -156,7 +156,7 @@ def test_a_motion_error_is_named_with_where_it_stands_and_no_move_follows_before
     stage.start_move(math.radians(30), SPEED)
     with pytest.raises(DeviceError, match=r"30\.0000 deg.*servo is off") as e:
         stage.wait(LONG)
-    assert "stands at 10.0000 deg, 2500 counts" in str(e.value)
+    assert "It is at 10.0000 deg, 2500 counts" in str(e.value)
     assert not isinstance(e.value, DeviceTimeout | DeviceRefused)
     with pytest.raises(DeviceRefused, match=r"servo is off.*Nothing has moved"):
         stage.start_move(math.radians(5), SPEED)

@@ -132,7 +132,7 @@ def test_a_slip_during_a_move_is_an_error_of_that_move_though_it_arrived(flag: s
     stage.start_move(math.radians(30), SPEED)
     rig.clock.sleep(1.0)
     rig.controller.device.axis.flags.add(flag)
-    with pytest.raises(DeviceError, match=rf"a fault at 30\.0000 deg.*stands at 30\.0000 deg.*{words} \({flag}\)"):
+    with pytest.raises(DeviceError, match=rf"a fault at 30\.0000 deg.*is at 30\.0000 deg.*{words} \({flag}\)"):
         stage.wait(LONG)
     stage.start_move(0.0, SPEED)  # it was told: the next move clears it
     assert stage.wait(LONG) == 0.0

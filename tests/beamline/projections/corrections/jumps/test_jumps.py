@@ -78,8 +78,8 @@ def test_an_alarm_without_a_jump_changes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("selection", "said"),
     [
-        (SELECTION.with_steps(Preparation("ignore")), "--flags ignore: 1 view with an alarm"),
-        (replace(SELECTION, cone=(100.0, 200.0)), "Views of a cone beam are not compared"),
+        (SELECTION.with_steps(Preparation("ignore")), "--flags ignore: 1 projection with an alarm"),
+        (replace(SELECTION, cone=(100.0, 200.0)), "In a cone beam jumps cannot be checked"),
     ],
 )
 def test_who_wants_them_as_they_are_and_cones_get_them_so(tmp_path: Path, selection: Selection, said: str) -> None:

@@ -69,7 +69,7 @@ def test_what_the_file_does_not_say_is_asked_for() -> None:
     found, said = Phase("20").filter_of(source, SELECTION.of(source))
     assert found == PHASE.filter_of(source, SELECTION.of(source))[0]
     assert "delta/beta 20 at 20 keV, 50 mm behind" in said
-    with pytest.raises(ConfigError, match=r"has 48 x 40"):
+    with pytest.raises(ConfigError, match=r"has only 48 x 40"):
         replace(PHASE, distance_mm=5e6).filter_of(source, SELECTION.of(source))
     with pytest.raises(ConfigError, match="--phase mixes neighbouring pixels"):
         _correction(SELECTION.with_steps(Preparation(noise="counts")))

@@ -114,7 +114,7 @@ def test_what_a_file_lacks_is_not_guessed(tmp_path: Path) -> None:
         assert np.isnan(source.table.exposures).all()
     assert describe(path)["format"] == "txrm"
     lost = write_compound(tmp_path / "a.txrm", streams(ImageInfo__Angles=None))
-    with pytest.raises(DataError, match="120 views"):
+    with pytest.raises(DataError, match="120 projections"):
         open_scan(lost)
     with open_scan(SourceOptions(lost, angles=SCAN.angles)) as source:
         np.testing.assert_array_equal(source.table.angles[2:], SCAN.angles)
