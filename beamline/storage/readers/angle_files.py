@@ -119,8 +119,8 @@ def _column(lines: list[str], wanted: str) -> tuple[str, str]:
     chosen = [n for n, title in enumerate(names) if titled and (title == wanted if wanted else _ANGLE.search(title))]
     chosen = chosen or ([int(wanted)] if wanted.isdecimal() else [])
     if len(chosen) != 1 or chosen[0] >= len(names):
-        held = ", ".join(names) if titled else f"{len(names)} columns without names"
-        raise ValueError(f"its columns are {held}; expected one whose name is a word for angle")
+        held = f"its columns are {', '.join(names)}" if titled else f"its {len(names)} columns have no names"
+        raise ValueError(f"{held}; expected one whose name is a word for angle")
     for number, line in enumerate(lines):
         cells = [] if line.lstrip()[:1] in ("", "#") or (titled and number == filled[0]) else line.split(mark)
         lines[number] = (cells + [""] * len(names))[chosen[0]].strip(' "') or "(empty)" * bool(cells)

@@ -242,7 +242,7 @@ def test_a_file_that_is_no_table_of_poses_is_refused(tmp_path: Path, text: str, 
 def test_poses_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path) -> None:
     views = np.arange(N)
     for head, columns, match in (
-        ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}; .* has {N} views"),
+        ("view,roll_deg", (np.append(views, N), np.zeros(N + 1)), f"states view {N}, but .* has {N} views"),
         ("view,shift_col_px", (views, np.full(N, 321.0)), "view 0 is displaced by 321 columns and 0 rows"),
         ("view,shift_row_px", (views, np.full(N, 25.0)), "view 0 is displaced by 0 columns and 25 rows"),
         ("view,angle_deg,roll_deg", (views, DEGREES + 2, TURNS[:, 0]), r"frame 4 at 2 degrees, .* at 0; .*same scan"),

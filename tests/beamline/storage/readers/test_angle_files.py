@@ -55,7 +55,7 @@ def test_the_angles_of_a_table_are_in_the_column_that_is_named_so(tmp_path: Path
         (table("theta_set,theta_read", "{i},{deg}"), "", "columns are theta_set, theta_read; .* FILE::COLUMN"),
         (table("frame,pos", "{i},{deg}"), "", "columns are frame, pos; .* FILE::COLUMN"),
         (table("frame,theta", "{i},{deg}"), "::omega", "columns are frame, theta"),
-        (table("", "{i},{deg}"), "::2", "columns are 2 columns without names"),
+        (table("", "{i},{deg}"), "::2", "its 2 columns have no names"),
         (table("", "{i},{deg}"), "", "number of a view and its angle.* FILE::COLUMN"),
         (table("frame,theta [turns]", "{i},{deg}"), "", "unit of its angles is 'turns'; give --angles-unit"),
         ("frame,theta\n0,0\n1,\n2,4", "", r"line 3 holds '\(empty\)'"),
