@@ -24,7 +24,11 @@ from tests.beamline.ran import Ran
 def test_a_scan_pauses_before_its_disk_is_full_and_goes_on_when_there_is_space() -> None:
     pause = PauseRequest()
     look, mb = partial(hold_for_space, pause, 100_000_000), 1_000_000
-    steps = [(500, 900, ""), (121, 800, ""), (119, 790, "119 MB are free.* 790 MB are still to come.* at 220 MB")]
+    steps = [
+        (500, 900, ""),
+        (121, 800, ""),
+        (119, 790, "119 MB are free.* 790 MB are still to be written.* when 220 MB"),
+    ]
     for free, left, said in [*steps, (219, 790, "Free some"), (220, 790, ""), (119, 790, "Free some")]:
         look(free * mb, left * mb)
         assert re.search(said, pause.reason) if said else pause.reason == ""

@@ -170,7 +170,7 @@ def test_a_log_that_is_none_or_has_no_end_keeps_no_command_waiting_and_fills_no_
             assert {reader.state()["frames"] for _ in range(3)} == {0}
     else:
         shown = CliRunner().invoke(main, ["watch", str(run), "--port", "0"])
-        assert shown.exit_code == 5 and f"{run} is no folder of a run" in shown.stderr
+        assert shown.exit_code == 5 and f"{run} is not the folder of a run" in shown.stderr
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**28

@@ -292,7 +292,7 @@ def test_how_long_the_volume_of_a_stopped_scan_is_waited_for_is_said_at_once_and
         seconds = begin + after
         assert not aborting()
     waiting = "Waiting for the live volume from the projections taken so far"
-    assert [text.split(".")[0] for text in told] == [f"{waiting}: {first + n} of at most {most} s" for n in (0, 5)]
+    assert [text.split(".")[0] for text in told] == [f"{waiting} ({first + n} of at most {most} s)" for n in (0, 5)]
     stop.abort()
     seconds += 100.0
     assert aborting() and len(told) == 2

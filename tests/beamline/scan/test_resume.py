@@ -207,7 +207,7 @@ def _other_camera(run: Path) -> None:
     ("change", "said"),
     [
         (_unreadable, "not the folder of a run"),
-        (_other_exposure, "another configuration: `exposure_s: 0.02`, not `exposure_s: 0.03`"),
+        (_other_exposure, "another configuration: `exposure_s: 0.02` instead of `exposure_s: 0.03`"),
         (_without_plan, "has no plan"),
         (_other_camera, "another camera: model another one; now it is model fake camera"),
     ],

@@ -131,7 +131,7 @@ def test_a_folder_that_takes_no_file_is_named_before_anything_moves(
     ran = Ran(tmp_path, instrument := FakeInstrument())
     assert isinstance(ran.error, DataError)
     assert re.search(
-        rf"{re.escape(str(ran.folder))} cannot be written to \(No space.*Nothing has moved", str(ran.error)
+        rf"{re.escape(str(ran.folder))} cannot be written to \(No space.*Nothing was moved", str(ran.error)
     )
     assert not instrument.is_open
 
