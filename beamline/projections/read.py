@@ -256,7 +256,7 @@ class ViewReader:
         self.named.update(news.tolist())
         self.warn(
             f"{count(news.size, 'projection')} of {self.scan.source.table.views.size} "
-            f"({frames_text(news)}) without beam: the shutter was closed, the beam was lost, or the file "
+            f"({frames_text(news)}) had no beam: the shutter was closed, the beam was lost, or the file "
             f"was never written there. {'It is' if news.size == 1 else 'They are'} left out{gap}."
         )
 
