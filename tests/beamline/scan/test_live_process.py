@@ -163,7 +163,9 @@ print(json.dumps({{"event": "done", "time": 2.0, "output": sys.argv[2], "axis_co
 """
 
     def wait() -> None:
-        wait_until(lambda: "recon_done" in said or any("again" not in text for text in said if "has ended" in text))
+        wait_until(
+            lambda: "recon_done" in said or any("again" not in text for text in said if "reconstruction ended" in text)
+        )
 
     said: list[str] = []
     instrument = FakeInstrument(at={10: wait})

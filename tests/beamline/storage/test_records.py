@@ -52,7 +52,7 @@ def test_one_flipped_bit_is_found_and_its_frame_is_left_out(path: Path, frames: 
     assert any("Look for an intact copy" in said for said in describe(path)["findings"])
     with h5py.File(path) as file:
         assert len(frames_in(file).numbers_taken()) == sum(frame.kind is FrameKind.PROJECTION for frame in frames) - 1
-    with pytest.raises(DataError, match=rf"it: {ROW}\..* Nothing was written"):
+    with pytest.raises(DataError, match=rf"stored with them: {ROW}\..* Nothing was written"):
         ingest(path, path.with_name("copy.h5"))
 
 

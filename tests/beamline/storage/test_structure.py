@@ -63,7 +63,7 @@ def test_values_that_are_the_bytes_of_another_file_and_claims_without_bytes(tmp_
         del file["entry/notes"]
         notes = file.create_dataset("entry/notes", (10,), "u1", chunks=(2**29,), maxshape=(None,), compression="gzip")
         notes.id.write_direct_chunk((0,), zlib.compress(bytes(10**6)))
-    with pytest.raises(DataError, match=r"claims 0\.537 GB"):
+    with pytest.raises(DataError, match=r"states 0\.537 GB"):
         open_scan(path)
 
 

@@ -170,7 +170,7 @@ def test_references_of_one_row_are_lines(tmp_path: Path) -> None:
             (4, 4),
             None,
             4,
-            "4 angles: whether its rows or its columns are the views is not known. Give --order view,col",
+            "Give --order view,col or .*there are 4 angles it is a sinogram, but either its rows or its columns",
         ),
         ((3, 5, 4), None, 5, "If each image is a sinogram of 5 projections, give --order row,view,col"),
         ((3, 4, 5), None, 5, "If each image is a sinogram of 5 projections, give --order row,col,view"),
