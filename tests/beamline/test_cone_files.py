@@ -121,7 +121,7 @@ def test_a_file_that_does_not_say_so_is_made_a_cone_by_words(tmp_path: Path) -> 
 def test_a_row_of_a_cone_is_shown_as_a_slice_at_its_height(scan: Path) -> None:
     row = 24
     with closing(ShownScan(open_scan(scan))) as shown:
-        assert shown.axis(row) == {"axis": AXIS, "said": "as the file states", "leans": False}
+        assert shown.axis(row) == {"axis": AXIS, "said": "from the file", "leans": False}
         tile = shown.fbp(row, AXIS, 0.0, TileRegion(0, 99, 0, 99), fast=False)
     step = PITCH * SOD / SDD
     z = (row - (SHAPE[0] - 1) / 2) * step

@@ -86,8 +86,8 @@ def _unit_problem(field: Entry, value: NDArray[Any], item: h5py.Dataset, source:
 
 
 def _varying(field: Entry, item: h5py.Dataset, source: ScanSource) -> tuple[str, float]:
-    """The effect of taking one length for all views, where the file states others for some, and their share; "" if it
-    is not visible.
+    """The effect of taking one length for all projections, where the file states others for some, and their share; ""
+    if it is not visible.
     """
     lengths = None if field.units is None or "mm" not in field.units else datasets.in_units(item, field.units)
     if lengths is None or lengths.size == 1:

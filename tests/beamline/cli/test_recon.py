@@ -149,7 +149,11 @@ def test_phase_is_retrieved_recorded_and_told(folder: Path) -> None:
     way = ("--phase", "paganin:Al", "--energy-kev", "20", "--pixel-size-um", "1", "--no-report")
     result = succeeds("recon", "scan.h5", "-m", "fbp", *way, "--distance-mm", "20")
     said = str(read_reconstruction(folder / "scan_fbp.h5").parameters["phase"])
-    assert said in result.stderr and said.startswith("Phase: Paganin's filter over 5.4") and "delta/beta 295.8" in said
+    assert (
+        said in result.stderr
+        and said.startswith("Phase retrieval with Paganin's filter over 5.4")
+        and "delta/beta 295.8" in said
+    )
     assert left(folder) == {"scan.h5", "scan_fbp.h5"}
 
 
@@ -163,6 +167,6 @@ def test_a_tilt_and_a_lens_are_corrected_recorded_and_told(folder: Path) -> None
     result = succeeds("recon", "scan.h5", "--config", "recipe.yaml")
     found = read_reconstruction(folder / "scan_fbp.h5").parameters
     assert (found["tilt_deg"], found["distortion_col"], found["distortion_factors"]) == (-0.5, 20.0, "(1.0, 1e-05)")
-    assert "Views are turned by -0.5 degrees." in result.stderr
-    assert "Views are turned by -0.5 degrees." in (folder / "scan_fbp.html").read_text(encoding="utf-8")
+    assert "The projections are rotated by -0.5 degrees." in result.stderr
+    assert "The projections are rotated by -0.5 degrees." in (folder / "scan_fbp.html").read_text(encoding="utf-8")
     assert left(folder) == {"scan.h5", "scan_fbp.h5", "scan_fbp.html", "lens.txt", "recipe.yaml"}

@@ -180,9 +180,14 @@ SO_FAR = {"recon.snapshot.h5", "recon.live.png"}
     ("frames", "status", "said", "left"),
     [
         ([], None, "No scan began in .* within 3 s", set()),
-        (FRAMES[:16], None, "has lost its writer and is not finished.*`beamline recover .*12 views", SO_FAR),
+        (
+            FRAMES[:16],
+            None,
+            "is no longer being written.* and is not finished.*`beamline recover .*12 views",
+            SO_FAR,
+        ),
         (FRAMES[:4], "stopped", "0 projections", set()),
-        (FRAMES[:5], "stopped", "1 projections", set()),
+        (FRAMES[:5], "stopped", "1 projection", set()),
         ([f for f in FRAMES if f.kind != 1], "complete", "without flats", set()),
     ],
     ids=["none", "dies", "no views", "one view", "no flats"],

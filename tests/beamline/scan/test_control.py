@@ -120,7 +120,10 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
 
     with verbs_taken(run, StopRequest(), PauseRequest(), choose):
         refused = CliRunner().invoke(main, ["decide", "again"])
-        assert refused.exit_code == 2 and "does not ask what to measure next: it is acquiring" in refused.stderr
+        assert (
+            refused.exit_code == 2
+            and "is not waiting for a decision on what to measure next: it is acquiring" in refused.stderr
+        )
         assert list((run / "control").iterdir()) == [] and not chosen
         enter(State.ASKING)
         taken = CliRunner().invoke(main, ["decide", str(run), "again"])
@@ -167,7 +170,7 @@ def test_a_log_that_is_none_or_has_no_end_keeps_no_command_waiting_and_fills_no_
             assert {reader.state()["frames"] for _ in range(3)} == {0}
     else:
         shown = CliRunner().invoke(main, ["watch", str(run), "--port", "0"])
-        assert shown.exit_code == 5 and f"{run} is no folder of a run" in shown.stderr
+        assert shown.exit_code == 5 and f"{run} is not the folder of a run" in shown.stderr
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**28

@@ -120,7 +120,7 @@ def gone(scan: Path, output: Path) -> Sequence[str]:
         [
             (gone, False, "no live reconstruction is running"),
             (None, False, "no live reconstruction is running"),
-            (live((1.0, 0.1, None)), True, "the beam is a cone, in which no gain is predicted"),
+            (live((1.0, 0.1, None)), True, "improvements are not predicted for a cone beam"),
         ]
     ),
 )
@@ -173,7 +173,7 @@ def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
 
     def react(event: Event) -> None:
         state = event.data.get("state")
-        if event.data.get("message") == "The scan goes on":
+        if event.data.get("message") == "The scan continues":
             seen.append(("goes on", instrument.is_open))
         if event.event != "state" or state not in (State.ASKING, State.PAUSED):
             return
@@ -187,7 +187,7 @@ def test_a_scan_that_asks_is_paused_and_asks_again(tmp_path: Path) -> None:
     assert ran.error is None
     assert seen == [("asking", False), ("paused", False), ("goes on", False), ("asking", False)]
     said = [event.data.get("message") for event in ran.of("state") if event.data["state"] == State.ASKING]
-    assert said == ["", "The scan asks again what to measure next"]
+    assert said == ["", "The scan again waits for a decision on what to measure next"]
     assert written(ran)[0] == [10] and len(ran.of("pass_ended")) == len(ran.of("next_chosen")) == 1
     ran.assert_good_file(12, "complete")
 

@@ -97,5 +97,5 @@ def test_a_follower_of_its_own_ends_when_its_scan_is_killed_before_anybody_recov
                     scan.kill()
             assert follower.wait(WITHIN) == 5
             assert follower.stderr is not None
-            assert "has lost its writer" in (said := follower.stderr.read()) and "scan --resume" in said
+            assert "is no longer being written" in (said := follower.stderr.read()) and "scan --resume" in said
     assert not (tmp_path / "own.h5").exists()

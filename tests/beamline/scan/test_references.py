@@ -27,7 +27,7 @@ from tests.beamline.ran import Ran
     [
         (210, 200, Faults(), "The flats 3-4: there is no beam in them"),
         (20000, 15000, Faults(), "The darks 0-2: there is light in them"),
-        (20000, 200, Faults(lost={3, 4}), "The 2 flats planned before the views did not come"),
+        (20000, 200, Faults(lost={3, 4}), "The 2 flats planned before the projections were not taken"),
     ],
 )
 def test_no_projection_is_taken_after_references_that_cannot_be_used(
@@ -134,7 +134,7 @@ def test_a_scan_with_too_little_light_says_so_before_its_first_view(tmp_path: Pa
         "recon.live=false", "scan.exposure_s=0.05",
     )  # fmt: skip
     run_scan(config, tmp_path / "runs", [events.append])
-    told = [i for i, event in enumerate(events) if "Too little light" in str(event.data.get("message"))]
+    told = [i for i, event in enumerate(events) if "the beam is too weak" in str(event.data.get("message"))]
     views = [i for i, e in enumerate(events) if e.event == "block_started" and e.data["kind"] == "projection"]
     assert len(told) == 1 and told[0] < views[0]
     found = float(events[told[0]].data["message"].split("has ")[1].split(" photons")[0])

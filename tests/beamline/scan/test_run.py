@@ -131,7 +131,7 @@ def test_a_folder_that_takes_no_file_is_named_before_anything_moves(
     ran = Ran(tmp_path, instrument := FakeInstrument())
     assert isinstance(ran.error, DataError)
     assert re.search(
-        rf"{re.escape(str(ran.folder))} cannot be written to \(No space.*Nothing has moved", str(ran.error)
+        rf"{re.escape(str(ran.folder))} cannot be written to \(No space.*Nothing was moved", str(ran.error)
     )
     assert not instrument.is_open
 
@@ -163,8 +163,8 @@ def test_a_device_that_cannot_be_let_go_is_told_and_the_file_is_good(
 
 
 def test_what_a_device_said_of_the_time_before_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    said = {"model": "m", "found_at_opening": "displaced while it stood (WM)"}
+    said = {"model": "m", "found_at_opening": "displaced while at rest (WM)"}
     monkeypatch.setattr(fakes.Stage, "describe", lambda stage: said)
     ran = Ran(tmp_path, FakeInstrument())
     (warning,) = ran.of("warning")
-    assert warning.data["message"] == "stage: before it was opened: displaced while it stood (WM)."
+    assert warning.data["message"] == "stage: settings before it was opened: displaced while at rest (WM)."

@@ -160,5 +160,5 @@ def test_a_check_that_hangs_costs_no_frame_and_holds_up_no_end(
     assert type(ran.error) is (ScanAborted if aborted else type(None))
     ran.assert_good_file(n, "stopped" if aborted else "complete")
     off, unjudged = ran.warnings
-    assert "The check mass has not come back from frame 7" in off
-    assert f"The monitor did not look at {n - 7} frames (7-{n - 1})" in unjudged
+    assert "its check mass has not finished frame 7" in off
+    assert f"The monitor did not check {n - 7} frames (7-{n - 1})" in unjudged

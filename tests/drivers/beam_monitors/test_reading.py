@@ -136,7 +136,7 @@ def test_a_page(kind: str) -> None:
 @pytest.mark.parametrize(("status", "reason"), [(404, "404 Not Found"), (503, "503 Service Unavailable")])
 def test_a_page_that_is_an_error(status: int, reason: str) -> None:
     """Even where the error's own page holds a number."""
-    with page(status, b"Ring current: 1 mA") as url, pytest.raises(DeviceError, match=f"the server answers {reason}"):
+    with page(status, b"Ring current: 1 mA") as url, pytest.raises(DeviceError, match=f"the server answered {reason}"):
         ring(url).reading()
 
 

@@ -48,10 +48,10 @@ def assert_known_to_be_unsafe(rig: Rig, scanned: Scanned) -> None:
     messages = [event.data["message"] for event in scanned.of("state") if event.data["state"] == State.FINISHING]
     assert messages == [UNSAFE]
     text = " ".join([*scanned.warnings, str(scanned.error)])
-    assert "The device may still be doing what it did before" in text
+    assert "The device may still be carrying out the earlier request" in text
     if rig.shutter_open:
         assert "shutter: it could not be closed" in text
-        assert "look before anybody goes near the beam" in text
+        assert "before anybody goes near the beam" in text
 
 
 def assert_kept(scanned: Scanned, views: list[int] | None = None, invalid: int = 0) -> None:
@@ -87,7 +87,7 @@ def assert_next_scan_works(rig: Rig, runs: Path, tells: str = "") -> None:
         assert_complete(scanned)
         if words:
             (warning,) = scanned.warnings
-            assert re.fullmatch(rf"stage: before it was opened: {words}\.", warning), warning
+            assert re.fullmatch(rf"stage: settings before it was opened: {words}\.", warning), warning
         else:
             assert scanned.warnings == []
         assert_at_rest(rig, scanned)

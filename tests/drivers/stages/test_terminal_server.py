@@ -67,7 +67,7 @@ FOREIGN = {
         {"first": b"Port already in use\r\n", "answer": b""},
         ("another client holds", "Close the other program"),
     ),
-    "serves another": ({"answer": b""}, ("no whole reply", "serve one client: another program may hold this port")),
+    "serves another": ({"answer": b""}, ("no whole reply", "allow one client only: another program may use this port")),
 }
 
 

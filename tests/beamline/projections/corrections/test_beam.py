@@ -27,5 +27,5 @@ def test_a_tube_and_a_table_are_read(tmp_path: Path) -> None:
 def test_a_wrong_table_is_refused(tmp_path: Path, wrong: str) -> None:
     table = tmp_path / "beam.txt"
     table.write_text(wrong)
-    with pytest.raises(ValueError, match=r"must hold two columns|neither a tube such as"):
+    with pytest.raises(ValueError, match=r"must have two columns|neither a tube such as"):
         in_beam("Al", str(table))

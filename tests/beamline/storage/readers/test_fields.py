@@ -326,7 +326,7 @@ def test_a_volume_of_sizes_that_differ_is_refused_unless_one_is_said(tmp_path: P
 def test_a_scan_is_judged_as_the_beam_that_is_said(tmp_path: Path, cone: tuple[float, float] | None) -> None:
     """High pixels are slices apart in a parallel beam, and refused in a cone."""
     refused = _refused(nxtomo(tmp_path / "s.nx", (f"{DETECTOR}/y_pixel_size", 2e-6, "m")), Selection(cone=cone))
-    assert ("in a cone beam" in refused) == (cone is not None)
+    assert ("a cone beam needs square pixels" in refused) == (cone is not None)
 
 
 def _refused(path: Path, selection: Selection) -> str:

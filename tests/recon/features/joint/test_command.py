@@ -75,7 +75,7 @@ def test_each_time_has_the_attenuation_of_its_time(series: Path) -> None:
 def test_one_of_the_volumes_is_exported_and_all_are_not(series: Path, tmp_path: Path) -> None:
     refused = beamline("export", str(series), "-o", str(tmp_path / "all.npy"))
     assert refused.exit_code == 5
-    assert "holds 2 volumes in time: name one by --at 0 to 1" in refused.output
+    assert "contains 2 volumes of a time series: choose one with --at 0 to 1" in refused.output
     for at, name in ((1, "last.npy"), (1, "last.h5")):
         done = beamline("export", str(series), "--at", str(at), "-o", str(tmp_path / name))
         assert done.exit_code == 0, done.output

@@ -79,15 +79,15 @@ def test_poses_of_a_volume_with_another_axis_are_told(
         return prepare(scan, Selection(axis_col=given, steps=steps))
 
     _, warnings = taken(taken(None)[0].axis_col + off)
-    assert any("go with the rotation axis of that volume" in each for each in warnings) is told
+    assert any("were found with the rotation axis" in each for each in warnings) is told
 
 
 def test_a_growing_scan_and_poses_of_a_file_are_refused(scan: Path, tmp_path: Path) -> None:
-    assert "it needs all views" in LEARN.needs_finished and Calibrate().needs_finished == ""
+    assert "it uses all projections" in LEARN.needs_finished and Calibrate().needs_finished == ""
     table = tmp_path / "poses.csv"
     rows = "\n".join(f"{view},1,0" for view in range(N))
     table.write_text(f"view,shift_col_px,shift_row_px\n{rows}\n")
-    with pytest.raises(ConfigError, match=r"--calibrate learns what .*give one of"):
+    with pytest.raises(ConfigError, match=r"--calibrate calibrates what .*Give either"):
         prepared(scan, replace(LEARN, terms=("roll",)), PosesOfFile(read_poses(str(table))))
     with pytest.raises(ValueError, match="'lean'"):
         Calibrate.__dataclass_fields__["terms"].metadata["option"].parse("axis,lean")
