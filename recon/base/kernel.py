@@ -41,7 +41,10 @@ class Kernel(StrEnum):
             if kernel.exponent == exponent:
                 return kernel
         known = ", ".join(f"{kernel.exponent:g} ({kernel})" for kernel in cls)
-        raise ValueError(f"no kernel has exponent {exponent:g}; known are {known}. A newer version may have written it")
+        raise ValueError(
+            f"unknown kernel exponent {exponent:g}; known exponents are {known}. A newer version of splatline may "
+            "have written it"
+        )
 
     @property
     def is_compact(self) -> bool:
@@ -115,8 +118,8 @@ class RayModel:
             raise ValueError(f"exact_above must be a relative error >= 0 (inf: never), got {self.exact_above}")
         if not self.rectified and self.exact_above < math.inf:
             raise ValueError(
-                "rectified=False needs exact_above=inf, because exact integrals are always rectified; "
-                f"got {self.exact_above}"
+                "rectified=False needs exact_above=inf, because exact integrals are always rectified; got "
+                f"exact_above={self.exact_above}"
             )
 
     def length(self, geometry: Geometry) -> float:
@@ -128,5 +131,5 @@ class RayModel:
         if self.rectified:
             return 0.0
         if geometry.width:
-            raise ValueError(f"rays with a width ({geometry.width}) need the corrected factor: leave rectified at True")
+            raise ValueError(f"rays with a width ({geometry.width}) need the corrected factor: leave rectified=True")
         return geometry.detector_shape[1] * geometry.sample_pitch / 2

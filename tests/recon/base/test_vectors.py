@@ -115,7 +115,7 @@ def test_views_that_no_such_detector_has_are_refused_with_the_view_and_by_how_mu
     rng = np.random.default_rng(2)
     cone = free_cone(rng, 3)
     cone[1, 6:9] *= 1.02
-    with pytest.raises(ValueError, match=r"view 1: .* off by 0\.[0-9]+ pixels"):
+    with pytest.raises(ValueError, match=r"projection 1: .* off by 0\.[0-9]+ pixels"):
         geometry_of_vectors(cone, SHAPE, cone=True)
     cone = free_cone(rng, 3)
     cone[2, 9:] *= -1

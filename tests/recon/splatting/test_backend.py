@@ -111,5 +111,5 @@ def test_a_cuda_device_that_is_not_there_is_said_by_name(device: str) -> None:
 
     if gpu.interpreted():
         pytest.skip("the interpreter stands in for any device")
-    with pytest.raises(RuntimeError, match=rf"{device} was.*CUDA.*on the cpu"):
+    with pytest.raises(RuntimeError, match=rf"{device}.*CUDA.*cpu"):
         backend_for(device)

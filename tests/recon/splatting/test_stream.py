@@ -187,7 +187,7 @@ def test_the_newest_view_may_be_replaced(data: np.ndarray) -> None:
     assert model.started and model._problem is not None and model.n_views == 22
     np.testing.assert_allclose(model._problem.projections, data[:22], atol=1e-5)
     np.testing.assert_allclose(model._problem.geometry.angles, ANGLES[:22])
-    with pytest.raises(ValueError, match="no view to replace"):
+    with pytest.raises(ValueError, match="no projection to replace"):
         StreamingFit(VIEWS, GRID).replace_newest(data[0])
     with pytest.raises(ValueError, match="nothing was changed"):
         model.replace_newest(np.full(SHAPE, np.nan, np.float32))
