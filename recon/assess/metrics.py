@@ -21,7 +21,9 @@ Array = NDArray[np.floating]
 
 def _same_shape(truth: Array, volume: Array) -> None:
     if truth.shape != volume.shape or truth.size == 0:
-        raise ValueError(f"truth has shape {truth.shape}, the volume {volume.shape}; they must be equal")
+        raise ValueError(
+            f"the ground truth has shape {truth.shape}, the volume {volume.shape}; both must have the same shape"
+        )
 
 
 def psnr(truth: Array, volume: Array, peak: float | None = None) -> float:
@@ -34,7 +36,9 @@ def psnr(truth: Array, volume: Array, peak: float | None = None) -> float:
     _same_shape(truth, volume)
     top = float(truth.max()) if peak is None else peak
     if not top > 0:
-        raise ValueError(f"the peak must be positive, got {top}; give one where the truth has no positive value")
+        raise ValueError(
+            f"the peak must be positive, got {top}; state the peak if the ground truth has no positive value"
+        )
     error = _squared_error(truth, volume) / truth.size
     return float(10 * np.log10(top**2 / error)) if error else float("inf")
 
@@ -50,14 +54,14 @@ def nrmse(truth: Array, volume: Array) -> float:
     _same_shape(truth, volume)
     norm = np.sqrt(_squared_error(np.broadcast_to(truth.dtype.type(0), truth.shape), truth))
     if norm == 0:
-        raise ValueError("the truth is zero everywhere: a relative error is not defined")
+        raise ValueError("a relative error is not defined, because the ground truth is zero everywhere")
     return float(np.sqrt(_squared_error(truth, volume)) / norm)
 
 
 def _data_range(truth: Array, data_range: float | None) -> float:
     span = float(truth.max() - truth.min()) if data_range is None else data_range
     if not span > 0:
-        raise ValueError(f"the data range must be positive, got {span}; give one where the truth is constant")
+        raise ValueError(f"the data range must be positive, got {span}; state it if the ground truth is constant")
     return span
 
 
@@ -165,7 +169,7 @@ def inscribed_cuboid(shape: tuple[int, int, int], margin: float = 0.1) -> tuple[
     side, and of the height, taken off at each end.
     """
     if not 0 <= margin < 0.5:
-        raise ValueError(f"the margin is a fraction of the side, 0 to 0.5, got {margin}")
+        raise ValueError(f"the margin must be a fraction of the side length, 0 to 0.5, got {margin}")
     nz, ny, nx = shape
     side = min(ny, nx) * np.cos(np.pi / 4)
     halves = (nz / 2 * (1 - 2 * margin), side / 2 * (1 - 2 * margin), side / 2 * (1 - 2 * margin))
@@ -200,7 +204,9 @@ def kmeans_mask(volume: Array, seed: int = 0) -> NDArray[np.int8]:
     some = tuple(rng.integers(0, n, _SAMPLE) for n in values.shape) if values.size > _SAMPLE else ...
     sample = np.asarray(values[some], np.float64).ravel()
     if np.ptp(sample) == 0:
-        raise ValueError(f"all voxels are {sample[0]:g}: there are no two regions to separate")
+        raise ValueError(
+            f"all voxels have the value {sample[0]:g}, so there are no two regions that a threshold could separate"
+        )
     threshold = _between_two_means(sample)
     mask = np.full(volume.shape, -1, np.int8)
     mask[box] = values > threshold
@@ -261,10 +267,12 @@ def snr_cnr(volume: Array, mask: NDArray[np.int8] | NDArray[np.bool_]) -> tuple[
         ValueError: where shapes differ, a region has no voxels, or some of its voxels are not finite.
     """
     if volume.shape != mask.shape:
-        raise ValueError(f"the volume has shape {volume.shape}, the mask {mask.shape}")
+        raise ValueError(f"the volume and the mask must have the same shape, got {volume.shape} and {mask.shape}")
     dense, empty = (volume[mask == kind] for kind in (1, 0))
     if not dense.size or not empty.size:
-        raise ValueError(f"the mask marks {dense.size} dense and {empty.size} empty voxels; both are needed")
+        raise ValueError(
+            f"the mask marks {dense.size} dense and {empty.size} empty voxels; at least one of each is needed"
+        )
     with np.errstate(invalid="ignore"):
         mean, base = (float(each.mean(dtype=np.float64)) for each in (dense, empty))
         spread = float(empty.std(dtype=np.float64))

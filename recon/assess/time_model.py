@@ -40,7 +40,7 @@ def parse_budget(text: str) -> float:
     except ValueError:
         seconds = math.nan
     if not (math.isfinite(seconds) and seconds > 0):
-        raise ValueError(f"{text!r} is not a time: expected a positive number with s, m or h, such as 30s, 2m or 1h")
+        raise ValueError(f"{text!r} is not a time; write a positive number with s, m or h, such as 30s, 2m or 1h")
     return seconds
 
 

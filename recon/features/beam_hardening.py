@@ -39,7 +39,7 @@ class Curve:
     def __post_init__(self) -> None:
         rising = (np.diff(self.measured) > 0).all() and (np.diff(self.corrected) > 0).all()
         if self.measured.shape != self.corrected.shape or self.measured.size < 2 or not rising:
-            raise ValueError("a curve needs two nodes or more, measured and corrected ascending")
+            raise ValueError("a curve needs at least two nodes, with ascending measured and corrected values")
 
     def linearise(self, views: F32, weights: F32 | None = None) -> None:
         """Replace line integrals of any shape, and their inverse variances, by corrected ones, in place."""
@@ -86,7 +86,7 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     few = slice(None, None, max(1, p.size // _MOST_RAYS))
     p, length = p[few], length[few]
     if (inside := np.count_nonzero(length)) < _FEWEST_RAYS:
-        raise NoCurveError(f"{inside} rays through the material are too few")
+        raise NoCurveError(f"too few rays go through the material: {inside}, and {_FEWEST_RAYS} are needed")
     slope = float(p @ length / (length @ length))
 
     def of(soft: float, hard: float, share: float) -> F64:
@@ -103,7 +103,7 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     explained = 1 - float(np.mean(solution.fun**2) / p.var())
     if explained < _LEAST_EXPLAINED:
         raise NoCurveError(
-            f"thickness explains {max(explained, 0):.0%} of the line integrals, of one material it would be "
-            f"{_LEAST_EXPLAINED:.0%} and more"
+            f"the sample seems to have several materials: its thickness explains only {max(explained, 0):.0%} of the "
+            f"variance of the line integrals, and for one material it explains at least {_LEAST_EXPLAINED:.0%}"
         )
     return curve_of_spectrum((hard + more, hard), (share, 1 - share), highest), explained

@@ -148,7 +148,10 @@ def remove_rings(
     check_arguments(remove_rings, locals())
     views, theta = np.array(projections, np.float32), np.asarray(angles, np.float64)
     if views.ndim != 3 or theta.shape != views.shape[:1]:
-        raise ValueError(f"projections {views.shape} must be [view, row, col] for angles {theta.shape}")
+        raise ValueError(
+            f"projections must be [view, row, col] with one angle for each projection, got shapes {views.shape} and "
+            f"{theta.shape}"
+        )
     if not (np.isfinite(views).all() and np.isfinite(theta).all()):
         raise ValueError("projections or angles hold NaN or infinite values; correct them first")
     warn_of_other_quantity(views)
@@ -176,8 +179,8 @@ def remove_rings_in_place(
         return taken, ""
     if len(views) < _FEWEST_VIEWS or views.shape[2] < NARROWEST:
         return taken, (
-            f"Rings: {len(views)} views of {views.shape[2]} columns are too few to tell stripes from the sample (at "
-            f"least {_FEWEST_VIEWS} of {NARROWEST}); none removed."
+            f"Rings: nothing was removed. {len(views)} projections of {views.shape[2]} columns are too few to tell "
+            f"stripes from the sample (at least {_FEWEST_VIEWS} projections of {NARROWEST} columns are needed)."
         )
     order = np.argsort(angles, kind="stable")
     axis = (views.shape[2] - 1) / 2 if axis_col is None else axis_col
@@ -185,7 +188,7 @@ def remove_rings_in_place(
     before = _typical_score(views[np.ix_(order, rows)])
     stages = (REMOVERS[rings],) if rings != "auto" else _stages(views[np.ix_(order, rows)], axis)
     if not stages:
-        return taken, "Rings: no stripes seen that are the detector's; none removed."
+        return taken, "Rings: nothing was removed, because the detector causes no visible stripes."
     for row in range(views.shape[1]):
         stripes = clean = views[order, row]
         for remove in stages:
@@ -196,7 +199,10 @@ def remove_rings_in_place(
         views[order, row] = clean
     after = _typical_score(views[np.ix_(order, rows)])
     how = ", ".join(_NAMES.get(remove, rings) for remove in stages)
-    return taken, f"Rings: removed by {how}; stripes of {before:.1f} times the noise of a column became {after:.1f}."
+    return taken, (
+        f"Rings: removed by {how}. The height of the stripes fell from {before:.1f} to {after:.1f} times the noise of "
+        "a column."
+    )
 
 
 _FAINTEST = 1e-5  # of the largest line integral: fainter stripes are seen in views without noise alone
@@ -210,9 +216,10 @@ def rings_seen(views: F32, angles: NDArray[np.float64], axis_col: float) -> str:
     if steady is None or not steady.stripes or steady.odd < _FAINTEST * float(np.abs(views).max()):
         return ""
     return (
-        f"Rings: pixels answer unequally, by {steady.odd:.2g} of line integral, {steady.score:.1f} times the noise of "
-        "a column; nothing was removed. --rings auto (by a filter), or of a finished scan --calibrate gains (by the "
-        "volume), removes them; where the sample has layers around the axis, compare the volumes."
+        f"Expect ring artefacts: pixel sensitivities differ by {steady.odd:.2g} in line integral, {steady.score:.1f} "
+        "times the noise of a column. Nothing was removed. Use --rings auto (a filter on the projections), or on a "
+        "finished scan --calibrate gains (measures the sensitivities with the volume). If the sample has layers "
+        "around the rotation axis, compare the volumes."
     )
 
 

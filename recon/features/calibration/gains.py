@@ -78,7 +78,10 @@ def learn_gains(
     """
     (rows, cols), n = geometry.detector_shape, geometry.n_views
     if n < LEAST_VIEWS or cols < LEAST_COLS:
-        raise ValueError(f"{n} views of {cols} columns are too few; {LEAST_VIEWS} of {LEAST_COLS} are needed")
+        raise ValueError(
+            f"too few data to measure pixel sensitivities: {n} projections of {cols} columns; at least {LEAST_VIEWS} "
+            f"projections of {LEAST_COLS} columns are needed"
+        )
     seen, unseen = split_views(geometry, _ONE_IN)
     gains, height = np.zeros((rows, cols), np.float32), _height(geometry)
     busiest = busiest_rows(projections, height).start

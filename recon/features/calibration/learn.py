@@ -112,11 +112,14 @@ class LearntGeometry:
         """The result as a sentence, in unbinned pixels."""
         told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
-            return "Geometry: the views show no error of it that matters; it is left as it was."
-        kept = f"{', '.join(self.dropped)}: left as it was, views held out do not confirm a change."
+            return "Geometry: unchanged, because the projections show no error that matters."
+        kept = f"{', '.join(self.dropped)}: unchanged, because held-out projections do not confirm a change."
         if not told:
             return f"Geometry: {kept}"
-        first = f"Geometry learnt: {told}. Views held out deviate by {self.after:.4g} in place of {self.before:.4g}."
+        first = (
+            f"Geometry calibrated: {told}. The deviation of held-out projections fell from {self.before:.4g} to "
+            f"{self.after:.4g}."
+        )
         return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first
 
     def parameters(self, binning: int = 1) -> Mapping[str, NDArray[np.float64] | float | str]:
@@ -150,9 +153,11 @@ def learn_geometry(
         ValueError: fewer than twelve views, or views without matter.
     """
     if geometry.n_views < LEAST_VIEWS:
-        raise ValueError(f"{geometry.n_views} views are too few; {LEAST_VIEWS} are needed")
+        raise ValueError(
+            f"too few projections to calibrate the geometry: {geometry.n_views}; at least {LEAST_VIEWS} are needed"
+        )
     if not projections.any():
-        raise ValueError("no absorbing sample in the views: all line integrals are 0")
+        raise ValueError("the projections show no absorbing sample: all line integrals are 0")
     factors = _factors(*geometry.detector_shape)
     steps = _STEPS[: len(factors)]
     total, done = _AXIS_STEPS + sum(steps) + 2 + len(terms), 0
@@ -248,5 +253,5 @@ def _text(change: GeometryChange, term: str, binning: int) -> str:
     if term == "axis":
         return f"the axis moves by {change.axis * binning:+.2f} px"
     if term == "shifts":
-        return f"views by up to {np.abs(change.shifts).max() * binning:.2f} px"
+        return f"projections shift by up to {np.abs(change.shifts).max() * binning:.2f} px"
     return f"{term} {math.degrees(getattr(change, term)):+.3f}°"

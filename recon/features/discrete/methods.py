@@ -63,7 +63,7 @@ class Discrete(VoxelMethod):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.levels is not None and not (len(self.levels) > 1 and all(np.diff(self.levels) > 0)):
-            raise ValueError(f"levels are {self.levels}: expected two or more, each above the one before")
+            raise ValueError(f"levels must be two or more values in ascending order, got {self.levels}")
 
     @property
     def trial_sweeps(self) -> int:
@@ -96,7 +96,9 @@ class Discrete(VoxelMethod):
     def predict(self, trial: Trial, so_far: TrialChoice) -> Prediction:
         """The prediction of the best few materials, or else that of total variation."""
         if trial.weight is None:
-            return Prediction(self.name, remark=f"{self.name}: no weight of total variation could be chosen")
+            return Prediction(
+                self.name, remark=f"{self.name}: not tried, because no weight of total variation could be chosen"
+            )
         found = self._choice(trial, trial.weight)
         return trial.prediction(self.name, found.best, Prior(trial.weight, materials=found.materials))
 

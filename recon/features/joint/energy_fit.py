@@ -37,7 +37,8 @@ def refuse_alike(cross_sections: F64) -> None:
     values = np.linalg.svd(cross_sections, compute_uv=False)
     if n < materials or values[-1] <= max(_LEAST_SINGULAR * values[0], _NOTHING):
         raise ValueError(
-            f"views of {n} energies cannot distinguish {materials} materials: give more energies, or fewer materials"
+            f"cannot separate {materials} materials with {n} {'energy' if n == 1 else 'energies'}: use more energies, "
+            "energies at which the materials differ more, or fewer materials"
         )
 
 
@@ -70,13 +71,15 @@ class EnergyViews:
         if self.weight is not None:
             require_views(self.geometry, self.weight, "weights")
         if not np.isfinite(self.projections).all():
-            raise ValueError("projections must be finite: give rays that were not measured the weight 0 and any value")
+            raise ValueError(
+                "projections must be finite. Give rays that were not measured any finite value and the weight 0"
+            )
         if self.cross_sections.ndim != 2:
             raise ValueError(f"cross_sections must be [energy, material], got shape {self.cross_sections.shape}")
         n = len(self.cross_sections)
         views = self.geometry.n_views
         if self.energy.shape != (views,) or self.energy.min() < 0 or self.energy.max() >= n:
-            raise ValueError(f"energy must be an index 0 ... {n - 1} for each of {views} views")
+            raise ValueError(f"energy must be an index from 0 to {n - 1} for each of the {views} projections")
         refuse_alike(self.cross_sections[np.unique(self.energy)])
 
     def select(self, views: NDArray[np.intp], rows: slice) -> EnergyViews:

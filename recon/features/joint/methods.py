@@ -46,7 +46,7 @@ class TimeSeries(Series):
 
     def run(self, problem: ReconProblem, control: RunControl) -> Reconstruction:
         if problem.grid != Grid.matching(problem.geometry):
-            raise ValueError("a series is reconstructed on the grid of its views: leave out the grid")
+            raise ValueError("a series is reconstructed on the grid of its projections; do not give a grid")
         n, times = problem.geometry.n_views, problem.use.times
         times = np.arange(n, dtype=np.float64) if times is None else np.asarray(times, np.float64)
         history = _History(self.sweeps, n, control)
@@ -129,13 +129,17 @@ def _measured(problem: ReconProblem) -> tuple[F32, F32 | None]:
     if weights is not None:
         data = np.where(weights > 0, data, np.float32(0))
     if not data.max() > 0:
-        raise ValueError("no line integral that is finite and has a weight is above 0: these views show no matter")
+        raise ValueError(
+            "these projections show no material: no line integral that is finite and has a weight is above 0"
+        )
     return data, weights
 
 
 def _because(still: float, moved: float, moves: bool) -> str:
     """A sentence on how views held out chose between rest and motion, with advice where they hardly differ."""
-    judged = f"views held out have a residual of {still:.4g} where nothing moves, and of {moved:.4g} with motion"
+    judged = f"the residual in held-out projections is {still:.4g} without motion and {moved:.4g} with motion"
     if moves or moved >= still:
-        return f"{'motion' if moves else 'no motion'}, as {judged}"
-    return f"no motion: {judged}, which is less, but too little to be sure. If the sample moved, compare with --moves"
+        return f"{'motion' if moves else 'no motion'}, because {judged}"
+    return (
+        f"no motion: {judged}, which is lower, but not by enough to be sure. If the sample moved, compare with --moves"
+    )

@@ -208,7 +208,7 @@ def fit_share(
     check_arguments(fit_share, locals())
     count = len(found.densities)
     if len(set(states)) != 2 or not set(states) <= set(range(count)):
-        raise ValueError(f"states must be two of the materials 0 ... {count - 1}, got {states}")
+        raise ValueError(f"states must be two different materials from 0 to {count - 1}, got {states}")
     steps = Countdown(go_on, STEPS, stop)
     smooth = _smoothness(views, found, states, steps)
     steps.left = min(steps.left, SOLUTION_STEPS)

@@ -68,7 +68,7 @@ class TimedViews:
         check_settings(self)
         n = self.geometry.n_views
         if self.times.shape != (n,) or not np.isfinite(self.times).all() or np.ptp(self.times) == 0:
-            raise ValueError(f"times must be {n} finite numbers, one a view, that are not all the same")
+            raise ValueError(f"times must be {n} finite numbers, one for each projection, and not all equal")
 
     @property
     def span(self) -> tuple[float, float]:
@@ -179,9 +179,9 @@ def _refuse_gaps(times: F64, knots: F64) -> None:
     if near.min() < _LEAST_NEAR:
         k = int(near.argmin())
         raise ValueError(
-            f"volume {k + 1} of {knots.size}, at time {knots[k]:g}, has {near[k]} views within "
-            f"{np.diff(knots)[0] / 2:g}, expected {_LEAST_NEAR} or more: ask for fewer volumes, or fit the views "
-            "before and after a gap separately"
+            f"too few projections near volume {k + 1} of {knots.size} (at time {knots[k]:g}): {near[k]} within "
+            f"{np.diff(knots)[0] / 2:g}, and at least {_LEAST_NEAR} are needed. Ask for fewer volumes, or reconstruct "
+            "the projections before and after a gap separately"
         )
 
 
@@ -263,7 +263,8 @@ def refuse_few(knots: int, n: int) -> None:
     """Raise ValueError if `n` views are too few for `knots` volumes."""
     if not 2 <= knots <= n // LEAST_VIEWS:
         raise ValueError(
-            f"{knots} volumes of {n} views: expected 2 volumes or more, and {LEAST_VIEWS} views or more for each"
+            f"cannot make {knots} volumes from {n} projections: ask for at least 2 volumes, with at least "
+            f"{LEAST_VIEWS} projections for each"
         )
 
 

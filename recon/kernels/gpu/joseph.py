@@ -72,7 +72,7 @@ class JosephRays:
             ValueError: for rolled, tilted or displaced views, or a box that reaches the source.
         """
         if not geometry.is_straight:
-            raise ValueError("these kernels project straight views only, without roll, tilt and centres")
+            raise ValueError("these GPU kernels need straight projections, without roll, tilt and centres")
         with np.errstate(invalid="ignore"):  # a parallel beam's source is infinitely far
             table, steep, views = cone.ray_table(geometry, grid)
         rise, (z, y, x) = geometry.pixel_pitch / grid.spacing[0], (n // 2 for n in grid.shape)
@@ -109,7 +109,7 @@ def _near(views: F64, shape: tuple[int, int, int]) -> tuple[int, int]:
     depths = depth + depth_y * y + depth_x * x  # [view, corner]
     places, least = (side + side_y * y + side_x * x) / depths, depths.min(1, keepdims=True)
     if least.min() <= 0:
-        raise ValueError("the box, with a voxel beyond it, reaches the source: give a smaller grid")
+        raise ValueError("the volume reaches the X-ray source (with a margin of one voxel); use a smaller grid")
     columns = np.maximum(np.abs(side_y - places * depth_y), np.abs(side_x - places * depth_x)) / least
     cols, rows = (2 * (float(most) * _SCALE + _MARGIN) for most in (columns.max(), 1 / least.min()))
     return int(cols) + 1, int(rows) + 1

@@ -176,7 +176,7 @@ class GpuView:
     ) -> None:  # fmt: skip
         """`beam` is the view as `beam_of` gives it, `room` that of its lists of tiles."""
         if geometry.width:
-            raise ValueError(f"rays with a width ({geometry.width}) are projected on the CPU only: use device 'cpu'")
+            raise ValueError(f"rays with a width ({geometry.width}) can only be projected on the CPU: use device 'cpu'")
         self._run, self._geometry, self._beam, self._length = run, geometry, beam, model.length(geometry)
         self.footprints = footprints(
             *run.active, geometry, beam, faint, cut, self._length, model.exact_above, run.kernel

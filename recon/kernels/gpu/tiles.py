@@ -139,8 +139,8 @@ def tile_lists(boxes: Tensor, shape: Sequence[int], edge: int, room: Room | None
             room.grow(pairs)
     if pairs >= 2**31:
         raise MemoryError(
-            f"{n} Gaussians touch {pairs} tiles of edge {edge}, more than lists hold (2^31); "
-            "take a smaller image or grid, or fewer or smaller Gaussians"
+            f"{n} Gaussians touch {pairs} tiles of edge {edge}, more than the lists can hold (2^31). Use a smaller "
+            "image or grid, or fewer or smaller Gaussians"
         )
     owners = torch.empty(pairs, dtype=torch.int32, device=device)
     tile = torch.empty(pairs, dtype=torch.int16 if n_tiles < _SHORT else torch.int32, device=device)
