@@ -1,8 +1,8 @@
-"""Beam hardening: line integrals of many energies turned into those of a thin layer's attenuation, for one material.
+"""Beam-hardening correction for a sample of one material: line integrals as the attenuation of a thin layer gives them.
 
-A beam of several energies loses the soft ones first, so line integrals grow more slowly than thickness. Bodies are
-darker inside (cupping), and between dense parts are streaks. For one material the relation is a curve, which is
-inverted (Herman 1979, Phys. Med. Biol. 24, 81).
+A beam of several energies loses the low energies first, so line integrals grow more slowly than thickness. In the
+volume, bodies are darker inside (cupping), and there are streaks between dense parts. For one material the relation is
+a curve, which is inverted (Herman 1979, Phys. Med. Biol. 24, 81).
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from recon.base.arrays import F32, F64
 
 _NODES = 2048
 _FEWEST_RAYS, _MOST_RAYS = 100, 5000
-_LEAST_EXPLAINED = 0.9  # share of the variance of line integrals that thickness explains, for a sample of one material
+# least share of the variance of line integrals that thickness explains in a sample of one material
+_LEAST_EXPLAINED = 0.9
 
 
 class NoCurveError(ValueError):
@@ -29,7 +30,7 @@ class Curve:
 
     Attributes:
         measured: float64 [node], ascending from 0.
-        corrected: float64 [node], ascending from 0. Below 0 the curve goes on along its first piece, at the end
+        corrected: float64 [node], ascending from 0. Below 0 the curve continues along its first piece, beyond the end
             along its last.
     """
 
@@ -56,8 +57,8 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
     """The hardening curve of a material whose attenuation is `attenuations`, in any unit, at the energies of a beam.
 
     Args:
-        weights: shares of the light detected at these energies, of any sum.
-        highest: measured line integral at the curve's end, at least.
+        weights: relative intensities detected at these energies (not normalised).
+        highest: the curve reaches at least this measured line integral.
     """
     mu, w = np.asarray(attenuations, np.float64), np.asarray(weights, np.float64)
     mu = mu / (mu @ w / w.sum())
@@ -67,14 +68,14 @@ def curve_of_spectrum(attenuations: ArrayLike, weights: ArrayLike, highest: floa
 
 
 def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tuple[Curve, float]:
-    """The curve of two energies that fits line integrals over paths through the material best.
+    """The two-energy curve that fits line integrals against path lengths in the material best.
 
     (Van de Casteele et al. 2002, Phys. Med. Biol. 47, 4181.) It always rises, with a falling slope.
 
     Args:
         measured: line integrals.
-        paths: lengths of the rays inside the material, in any unit; 0 for rays beside it, which must be air.
-        highest: as of `curve_of_spectrum`.
+        paths: lengths of the rays inside the material, in any unit; 0 for rays that miss it, which must be air.
+        highest: as in `curve_of_spectrum`.
 
     Returns:
         The curve, and the share of the line integrals' variance that it explains.
@@ -95,7 +96,7 @@ def curve_of_paths(measured: ArrayLike, paths: ArrayLike, highest: float) -> tup
     def residuals(x: F64) -> F64:
         return np.asarray(of(x[0] + x[1], x[0], x[2]) - p)
 
-    from scipy.optimize import least_squares  # half a second
+    from scipy.optimize import least_squares  # loading takes half a second
 
     bounds = (1e-6 * slope, 0, 0.01), (np.inf, np.inf, 0.99)
     solution = least_squares(residuals, (0.8 * slope, 0.8 * slope, 0.4), bounds=bounds, x_scale=(slope, slope, 1.0))

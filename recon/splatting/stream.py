@@ -202,7 +202,7 @@ class StreamingFit:
         model has learnt from bad projections.
 
         Raises:
-            ValueError: as `add_views`, or there are no views; nothing is changed.
+            ValueError: as for `add_views`, or there are no projections; nothing is changed.
         """
         which = np.arange(self.n_views) if kept is None else np.asarray(kept, np.intp)
         theta = np.asarray(self._angles)[which]
@@ -234,7 +234,7 @@ class StreamingFit:
         """Replace the line integrals [row, col] of the newest view: its correction has changed.
 
         Raises:
-            ValueError: as `add_views`, or there is no view; nothing is changed.
+            ValueError: as for `add_views`, or there is no projection; nothing is changed.
         """
         if not self._angles:
             raise ValueError("there is no projection to replace")
