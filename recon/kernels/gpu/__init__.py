@@ -1,16 +1,16 @@
-"""Kernels for CUDA devices, in Triton and torch: the CPU kernels' operations; imported only if a GPU is used.
+"""Kernels for CUDA devices (Triton and torch) with the operations of the CPU kernels; imported only if a GPU is used.
 
-They work on contiguous float32 torch tensors. Sums are gathered, never scattered. An image tile or a brick of voxels
-sums the Gaussians on its list; a Gaussian sums the gradient under it. So there are no atomics, and the same input gives
-the same bits. With TRITON_INTERPRET=1 in the environment, before the first import, the same kernels run on the CPU,
-slowly, for tests.
+They work on contiguous float32 torch tensors. Sums are gathered, never scattered: an image tile or a brick of voxels
+sums the Gaussians in its list, and a Gaussian sums the gradient in its footprint. So there are no atomics, and the same
+input gives bit-identical results. If TRITON_INTERPRET=1 is set in the environment before the first import, the same
+kernels run slowly on the CPU, for tests.
 """
 
 from __future__ import annotations
 
 import os
 
-# Triton 3.9 warns unless this is set, since its default will change; the kernels use fused multiply-adds.
+# Triton 3.9 warns if this is not set, because its default will change; the kernels use fused multiply-adds.
 os.environ.setdefault("TRITON_DEFAULT_FP_FUSION", "1")
 
 try:
