@@ -33,8 +33,8 @@ FIRST_THRESHOLD = 8.0
 projections, for which no setting is better; -0.3 dB on bone."""
 
 PULL = 0.03
-"""Weight of the pull towards the denoised patches, as a share of the largest eigenvalue of AᵀWA. At ten times this:
--1.3 dB on bone; at a tenth: -1.2 dB on cement."""
+"""Weight of the pull towards the denoised patches, as a share of the largest eigenvalue of AᵀWA. Without it, at ten
+times this value: -1.3 dB on bone; at a tenth: -1.2 dB on cement."""
 
 FALL = 0.8
 """Factor of the threshold from one round to the next. Without it: -0.3 and -0.8 dB on bone and cement."""
@@ -46,20 +46,20 @@ SHARE_OF_NOISE = 0.75
 cement, if no projections are held out."""
 
 MOST_BY_RESIDUAL = 4.0
-"""Largest factor by which the residual may raise the first weight. With a factor of one: -1.7 and -1.9 dB on bone and
-cement from 180 projections without held-out ones, -1.4 dB on a walnut."""
+"""Largest factor by which the residual may raise the first weight. Without it, with a factor of one: -1.7 and -1.9 dB
+on bone and cement from 180 projections without held-out ones, -1.4 dB on a walnut."""
 
 MANY_VIEWS = 0.3
 """Share by which the noise is assumed higher if the projections determine the volume. Without it: -1.1 and -1.4 dB on
 bone and cement from 180 projections, if no projections are held out."""
 
 HALF_OF_MANY = 0.45
-"""Number of projections from which `MANY_VIEWS` rises from 0, in units of π / 2 times the number of columns. At twice
-this number it is reached in full."""
+"""It belongs to `MANY_VIEWS`: the number of projections, in units of π / 2 times the number of columns, from which that
+value rises from 0. At twice this number it is reached in full."""
 
 SETTLED = 3 / 8
-"""Share of the iterations after which the residual may raise the weight. After 3 of 40 iterations of OS-SIRT-TV
-instead: -5.6 dB on cement in a cone."""
+"""Share of the iterations after which the residual may raise the weight. Without it, after 3 of 40 iterations of
+OS-SIRT-TV: -5.6 dB on cement in a cone."""
 
 LEAST_OF_SUBSET = 12
 """Smallest number of projections in a subset, because the steps of smaller subsets disagree. Without it: -1.4 and -0.7
@@ -73,8 +73,8 @@ thorax (tested once, not tuned). With four subsets, a shell from 24 projections 
 # Where are the first Gaussians, and how many are there?
 
 VOXELS_A_GAUSSIAN = 60
-"""Voxels per Gaussian in the cylinder of the field of view. With half and a quarter as many Gaussians: -0.1 and -0.5
-dB."""
+"""Voxels per Gaussian in the cylinder of the field of view. Without it, with half and a quarter as many Gaussians: -0.1
+and -0.5 dB."""
 
 SPREAD = 0.6
 """Width of a first Gaussian, divided by the distance to its neighbours. Without it: the same quality, and a tenth to a
@@ -89,21 +89,22 @@ WILD_PIXEL = 10.0
 one pixel of 10⁶ costs a fit of 400 steps 24 dB, one of 1000 costs 1.0 dB."""
 
 WILD_VIEWS = 0.1
-"""Largest share of the projections that may contain pixels beyond `WILD_PIXEL`."""
+"""It belongs to `WILD_PIXEL`: the largest share of the projections that may contain such pixels."""
 
 EMPTY = 0.15
 """Share of a mean value below which edges count as empty. The air around a walnut has 0.07. Without it, no box is wider
 than the field of view: -16 dB on grains that reach twice as far."""
 
 LIGHT_WEIGHT = 1e-4
-"""Weight of total variation, as `FistaTv.tv_weight`, in test reconstructions that measure the width of the sample. At
-ten times this, grains that reach 1.5 times as far as the field of view are measured as 2.5 times; at a third and at
-three times, the result is the same."""
+"""Weight of total variation, as `FistaTv.tv_weight`, in test reconstructions that measure the width of the sample.
+Without it, at ten times this value, grains that reach 1.5 times as far as the field of view are measured as 2.5 times;
+at a third and at three times, the result is the same."""
 
 # How is a fit made?
 
 DEFAULT_STEPS = 400
-"""Steps of a fit before its voxel refinement. A shell has 34.9 dB after 100 steps, 41.3 dB after 400."""
+"""Steps of a fit before its voxel refinement. Without it, after 100 steps, a shell has 34.9 dB; after 400 it has 41.3
+dB."""
 
 PACE = 26.0
 """Factor on the published learning rates, which are for 30 000 steps. Without it: -1 to -4 dB after 1000 steps."""
@@ -113,11 +114,12 @@ VIEWS_A_STEP = 2
 from 12 projections."""
 
 NARROWEST = 0.3
-"""Smallest standard deviation of a Gaussian in pixels. With the published 0.128: -0.6 dB on a shell in a cone."""
+"""Smallest standard deviation of a Gaussian in pixels. Without it, with the published 0.128: -0.6 dB on a shell in a
+cone."""
 
 TV_OF_NOISE = 3e5
-"""Weight of total variation, divided by the variance of a pixel's noise, times the pixels of a Gaussian. With the
-published weight: -2.2 and -0.8 dB on cement and bone from 12 projections, -0.5 dB on a teapot in a cone."""
+"""Weight of total variation, divided by the variance of a pixel's noise, times the pixels of a Gaussian. Without it,
+with the published weight: -2.2 and -0.8 dB on cement and bone from 12 projections, -0.5 dB on a teapot in a cone."""
 
 TV_LEAST = 0.02
 """Smallest weight of total variation. Without it: -0.7 dB on a shell in a cone."""
@@ -131,19 +133,19 @@ it: -0.5 dB on a teapot in a cone, -0.2 dB on a shell from 12 projections."""
 
 TV_SHARE = 4
 """The sides of the box in which total variation is computed are the grid's divided by this. In a smaller box, each
-position would get rare, large steps. With the published box: -1.8 dB on a battery of 256³ voxels."""
+position would get rare, large steps. Without it, with the published box: -1.8 dB on a battery of 256³ voxels."""
 
 APART = 0.75
-"""Distance of each half of a split Gaussian from the centre, in standard deviations. With the published split: -12.9
-and -10.8 dB in fits during a scan of a shell and a teapot."""
+"""Distance of each half of a split Gaussian from the centre, in standard deviations. Without it, with the published
+split: -12.9 and -10.8 dB in fits during a scan of a shell and a teapot."""
 
 LOST = 3.0
 """A Gaussian this many standard deviations outside the box is removed. Without it: -4.0, -3.6 and -1.2 dB in fits
 during a scan of a shell, a teapot and a foam."""
 
 GROWTH = 1.5
-"""Largest number of Gaussians, as a multiple of the first number. With the published 10: -1.9 dB on a shell and a
-teapot in a cone after 400 steps."""
+"""Largest number of Gaussians, as a multiple of the first number. Without it, with the published 10: -1.9 dB on a shell
+and a teapot in a cone after 400 steps."""
 
 # How is a fit refined?
 
@@ -152,4 +154,4 @@ WILD_RAY = 0.5
 dB on a teapot with 2 wild pixels in 10 000."""
 
 FEW_WILD = 0.01
-"""If more than this share of the rays is wild (see `WILD_RAY`), the fit has failed, and all rays count."""
+"""It belongs to `WILD_RAY`: if more than this share of the rays is wild, the fit has failed, and all rays count."""

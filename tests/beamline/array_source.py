@@ -1,4 +1,4 @@
-"""A scan in memory that notes what is read of it."""
+"""A scan in memory that records which parts of it are read."""
 
 from __future__ import annotations
 

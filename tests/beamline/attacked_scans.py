@@ -1,4 +1,4 @@
-"""Small scans by formula, right ones of all kinds and attacked ones, whose findings test_findings.py keeps."""
+"""Small analytic scans of all kinds, correct ones and ones with a fault; test_findings.py stores their findings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run of the fake instrument in passes, whose choices a test makes."""
+"""A run of the fake instrument in passes, in which the test makes the decisions."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager

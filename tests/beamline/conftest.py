@@ -1,4 +1,4 @@
-"""Figures are drawn where a test looks at them; elsewhere drawing would take most of a report's time.
+"""Figures are drawn only in tests that look at them, because drawing would take most of the time of a report.
 
 The Zaber's wire is one of the tests: a fixture makes it the simulated controller of its kind.
 """

@@ -1,4 +1,4 @@
-"""A fake instrument on a virtual clock; it writes what it was doing into its pixels: frames prove the choreography."""
+"""A fake instrument on a virtual clock that writes its state into its pixels, so that frames prove the sequence."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Set

@@ -1,4 +1,4 @@
-"""What can be measured after a pass, as an event says it."""
+"""The choices of what to measure after a pass, as an event states them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Prepared projections: of a scan as a reconstruction prepares it, or made of line integrals."""
+"""Prepared projections: from a scan as a reconstruction prepares it, or from given line integrals."""
 
 from __future__ import annotations
 

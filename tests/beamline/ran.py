@@ -1,4 +1,4 @@
-"""A run of the fake instrument and everything that it left, for tests of the run and of what runs beside it."""
+"""A run of the fake instrument and all its files, for tests of the run and of processes next to it."""
 
 import os
 import shutil

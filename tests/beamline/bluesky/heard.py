@@ -1,4 +1,4 @@
-"""Documents as a subscriber gets them."""
+"""Collects bluesky documents as a subscriber receives them."""
 
 from typing import Any
 from urllib.parse import unquote, urlsplit

@@ -1,4 +1,4 @@
-"""Commands are tested as from a terminal, wherever the tests themselves run."""
+"""Commands are tested as if they ran in a terminal, wherever the tests run."""
 
 import signal
 import sys

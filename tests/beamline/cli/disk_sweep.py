@@ -1,4 +1,4 @@
-"""Runs commands again and again in forks of this process, each with another fault of the disk (tests.faulty_disk).
+"""Runs commands repeatedly in forks of this process, each time with another disk fault (tests.faulty_disk).
 
     LD_PRELOAD=faulty_disk.so FAULTY_DISK_PATTERN=out/ python -m tests.beamline.cli.disk_sweep FOLDER POINTS COMMAND...
 

@@ -1,4 +1,4 @@
-"""`beamline recon`: options, what is printed and what is left."""
+"""`beamline recon`: options, output on the terminal, and files."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""A real configuration runs as it is with simulated devices, whatever its devices are; faults name their line."""
+"""A real configuration also runs with simulated devices, for all kinds of devices; errors name their line."""
 
 from dataclasses import astuple
 from pathlib import Path

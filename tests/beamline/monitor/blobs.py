@@ -1,4 +1,4 @@
-"""A turning sample of Gaussian blobs, as previews of 32 x 128 blocks: fast enough for scans of hundreds of views."""
+"""A rotating sample of Gaussian blobs, as previews of 32 x 128 blocks: fast enough for hundreds of projections."""
 
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Frames for the monitor's tests: discs in closed form, photon noise, offset; and faults put in by hand."""
+"""Frames for the monitor's tests: analytic discs, photon noise, offset, and faults put in by hand."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace

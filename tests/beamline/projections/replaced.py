@@ -1,4 +1,4 @@
-"""A scan of three balls in a beam with photon noise, whose frames can be replaced; and what a volume of it is worth."""
+"""A scan of three balls with photon noise whose frames can be replaced, and the quality of its volume."""
 
 from __future__ import annotations
 

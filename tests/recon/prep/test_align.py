@@ -200,7 +200,7 @@ def test_bad_input_is_refused(scan: tuple[NDArray[np.float64], NDArray[np.float6
     views, angles = scan
     with pytest.raises(ValueError, match=r"one angle for each view, got .* \(45,\)"):
         axis_from_sinogram(views, angles[1:])
-    with pytest.raises(ValueError, match="3 views of 128 columns"):
+    with pytest.raises(ValueError, match="3 projections of 128 columns"):
         find_axis(views[:3], angles[:3])
     with pytest.raises(ValueError, match="view, row, col"):
         find_axis(views[:, 0], angles)

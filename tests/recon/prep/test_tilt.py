@@ -81,7 +81,7 @@ def test_what_does_not_show_an_axis_is_refused() -> None:
     for cols in (1, 2, 7):
         with pytest.raises(ValueError, match=f"{cols} columns"):
             _found(noise[:, :, :cols], HALF.angles)
-    with pytest.raises(ValueError, match="3 bands of rows are too few; at least 4"):
+    with pytest.raises(ValueError, match="3 bands of rows are too few to measure the tilt; at least 4"):
         find_tilt(noise[:, :3], np.arange(3.0), HALF.angles)
 
 

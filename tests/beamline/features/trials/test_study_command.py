@@ -1,4 +1,4 @@
-"""`beamline study`: the table and its figures, rows that are left out, what an interruption leaves."""
+"""`beamline study`: the table with its figures, rows that are left out, and what an interruption leaves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses of views from a file become geometry: read, assigned to the views of a scan, and kept with the volume."""
+"""Poses from a file become geometry: they are read, assigned to projections, and stored with the volume."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""--calibrate: places of views and the axis are learnt from a scan's own views, and enter the geometry alone."""
+"""--calibrate: shifts and the axis are measured from the projections, and change only the geometry."""
 
 from __future__ import annotations
 
