@@ -1,4 +1,4 @@
-"""A small scan of a ball away from the axis, with any simulated stage on a virtual clock; the images show the angles."""
+"""A small scan of a ball away from the axis, for any simulated stage on a virtual clock; the images show the angles."""
 
 from functools import cache
 from typing import Any

@@ -368,7 +368,7 @@ def test_bad_input_is_refused_with_its_values() -> None:
         correct(counts, at, References(dark, ((3.0, flat), (3.0, flat))))
     with pytest.raises(ValueError, match=r"\(40, 9\) do not fit into 48"):
         correct(counts, at, references, CorrectionSettings(air=(40, 9)))
-    with pytest.raises(ValueError, match=r"positions of views \[2\]"):
+    with pytest.raises(ValueError, match=r"positions of projections \[2\]"):
         correct(counts, np.where(at == 2, np.nan, at), references)
     with pytest.raises(ValueError, match=r"\(16, 48\), got \(5, 5\)"):
         correct(counts, at, references, masked=np.zeros((5, 5), bool))
