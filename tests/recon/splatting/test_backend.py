@@ -93,7 +93,7 @@ def test_a_box_leaves_positions_alone_where_asked(random_gaussians: Make, rng: n
 def test_devices_without_a_backend_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(backend_for("cpu"), Cpu)
     for unknown in ("mps", "gpu", "CUDA", "cuda1", "cuda:", "cuda:one", "cuda:-1", "cuda:0,1", ""):
-        with pytest.raises(ValueError, match=rf"'{unknown}' was.*'cpu'.*one of these"):
+        with pytest.raises(ValueError, match=rf"must be 'cpu' or 'cuda', got '{unknown}'"):
             backend_for(unknown)
     for name in [name for name in sys.modules if name.startswith("recon.kernels.gpu")]:
         monkeypatch.delitem(sys.modules, name)
