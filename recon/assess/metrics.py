@@ -148,8 +148,8 @@ def ssim_of_whole_slices(truth: Array, volume: Array) -> float:
         for first, second in zip(np.moveaxis(truth, across, 0), np.moveaxis(volume, across, 0), strict=True):
             x, y = np.asarray(first, np.float64), np.asarray(second, np.float64)
             covariance = ((x - x.mean()) * (y - y.mean())).mean()
-            light = (2 * x.mean() * y.mean() + c1) / (x.mean() ** 2 + y.mean() ** 2 + c1)
-            by_slice.append(light * (2 * covariance + c2) / (x.var() + y.var() + c2))
+            luminance = (2 * x.mean() * y.mean() + c1) / (x.mean() ** 2 + y.mean() ** 2 + c1)
+            by_slice.append(luminance * (2 * covariance + c2) / (x.var() + y.var() + c2))
         means.append(np.mean(by_slice))
     return float(np.mean(means))
 

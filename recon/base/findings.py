@@ -112,11 +112,11 @@ def _of_value(path: KeyPath, name: str, data: Any, schema: Schema, missing: bool
 def _path(loc: Sequence[str | int], data: Any, missing: bool) -> KeyPath:
     """The key path in the file: pydantic's location without the names of union members."""
     path: list[str | int] = []
-    for at, part in enumerate(loc):
+    for index, part in enumerate(loc):
         if _has(data, part):
             data = data[part]
             path.append(part)
-        elif missing and at == len(loc) - 1:
+        elif missing and index == len(loc) - 1:
             path.append(part)
     return tuple(path)
 

@@ -39,10 +39,10 @@ def class_levels(values: NDArray[np.floating]) -> list[NDArray[np.floating]]:
     least = max(4, round(_LEAST * flat.size))
     classes, splits = [flat], [_split(flat, least)]
     while len(classes) < _MOST and max(gain for gain, _ in splits) > 0:
-        at = max(range(len(splits)), key=lambda k: splits[k][0])
-        place = splits[at][1]
-        parts = [classes[at][:place], classes[at][place:]]
-        classes[at : at + 1], splits[at : at + 1] = parts, [_split(part, least) for part in parts]
+        best = max(range(len(splits)), key=lambda k: splits[k][0])
+        place = splits[best][1]
+        parts = [classes[best][:place], classes[best][place:]]
+        classes[best : best + 1], splits[best : best + 1] = parts, [_split(part, least) for part in parts]
     return classes
 
 
@@ -71,13 +71,13 @@ def grey_windows(values: NDArray[np.floating]) -> dict[str, tuple[float, float]]
     if not classes:
         return {"matter": (0.0, 1.0), "all": (0.0, 1.0)}
     frequent = _FREQUENT * sum(each.size for each in classes[1:])  # rarer classes are edges between materials
-    matter = [each for at, each in enumerate(classes) if at == 0 or each.size >= frequent]
-    levels, sizes = [float(np.median(each)) for each in matter], [each.size for each in matter]
+    materials = [each for at, each in enumerate(classes) if at == 0 or each.size >= frequent]
+    levels, sizes = [float(np.median(each)) for each in materials], [each.size for each in materials]
     far = len(levels) > 2 and levels[-1] - levels[0] > _METAL * (levels[-2] - levels[0])
     top = len(levels) - 1 - (far and sizes[-1] < _RARER * sum(sizes[1:-1]))
 
     def window(top: int) -> tuple[float, float]:
-        low, high = float(np.percentile(matter[0], _DARKER)), float(np.percentile(matter[top], _BRIGHTER))
+        low, high = float(np.percentile(materials[0], _DARKER)), float(np.percentile(materials[top], _BRIGHTER))
         if top > 0:
             low = max(low, levels[0] - _BEYOND * (high - levels[0]))
         return apart(low, high + _BEYOND * (high - levels[top]))

@@ -141,9 +141,9 @@ def usual_weight(weights: F32, data: F32) -> float:
     total variation would then dominate in the sample.
     """
     top = max(float(np.percentile(some_values(data, 100_003), 99)), 0.0)
-    matter, weighed = 0.0, 0.0
+    depths, weighed = 0.0, 0.0
     for view, weight in zip(data, weights, strict=True):
         depth = np.clip(view, 0, top) * (weight > 0)
-        matter += float(depth.sum(dtype=np.float64))
+        depths += float(depth.sum(dtype=np.float64))
         weighed += float((depth * weight).sum(dtype=np.float64))
-    return weighed / matter if matter > 0 else float(np.mean(weights[weights > 0], dtype=np.float64))
+    return weighed / depths if depths > 0 else float(np.mean(weights[weights > 0], dtype=np.float64))

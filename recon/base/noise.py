@@ -98,11 +98,11 @@ def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
         return math.inf
     rows = rows[:: -(-rows.size // _BOW_TIE_ROWS)]
     middle = round(float(axis.mean()))
-    at = np.arange(max(0, middle - half), min(cols, middle + half + 1))
-    window = np.hanning(at.size + 2)[1:-1]
-    omega = 2 * np.pi * bins / at.size
-    waves = window[:, None] * np.exp(-1j * omega * (at[:, None] - middle))
-    spectrum = np.einsum("vcr,cm->vmr", lines[order][:, at][:, :, rows], waves, optimize=True)
+    chosen = np.arange(max(0, middle - half), min(cols, middle + half + 1))
+    window = np.hanning(chosen.size + 2)[1:-1]
+    omega = 2 * np.pi * bins / chosen.size
+    waves = window[:, None] * np.exp(-1j * omega * (chosen[:, None] - middle))
+    spectrum = np.einsum("vcr,cm->vmr", lines[order][:, chosen][:, :, rows], waves, optimize=True)
     spectrum *= np.exp(1j * omega * (axis[order, None] - middle))[:, :, None]
     theta = np.unwrap(geometry.angles[order])
     if np.ptp(theta) < 1.01 * np.pi:  # the projections of the other 180° are these, mirrored
@@ -111,7 +111,7 @@ def _beyond_the_bow_tie(lines: F32, geometry: Geometry) -> float:
     power = np.abs(np.fft.fft(spectrum, axis=0)) ** 2 / (count * (window**2).sum())
     reach = half + 0.5 + float(np.ptp(axis))
     off = reach * geometry.sample_pitch / geometry.sod
-    bound = reach / (1 - off) * (omega + 4 * np.pi / at.size) + 2 if off < 1 else np.full(bins.size, np.inf)
+    bound = reach / (1 - off) * (omega + 4 * np.pi / chosen.size) + 2 if off < 1 else np.full(bins.size, np.inf)
     free = np.abs(np.fft.fftfreq(count) * count)[:, None] > bound
     few = power[free]
     return math.sqrt(float(few.mean())) if few.size >= _LEAST_POWERS else math.inf

@@ -199,10 +199,10 @@ def plugins(
                 found[point.name] = made(point.name, point.load())
         except (Exception, SystemExit) as error:  # an error in another package must not stop a scan
             package = f" of the package {point.dist.name}" if point.dist is not None else ""
-            told = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {error}"
+            reason = f"{point.name!r}{package} ({point.value}) was left out: {type(error).__name__}: {error}"
             warnings.warn(
-                f"The {kind.replace('_', ' ')} {_one_line(told)}. Everything else works without it. To use it, repair "
-                "that package; otherwise uninstall it.",
+                f"The {kind.replace('_', ' ')} {_one_line(reason)}. Everything else works without it. To use it, "
+                "repair that package; otherwise uninstall it.",
                 stacklevel=2,
             )
     return found

@@ -34,12 +34,12 @@ class Slab:
     @property
     def share(self) -> NDArray[np.float32]:
         """[slice] weight of each reconstructed slice in the volume; the weights of all slabs add up to 1."""
-        at, width = np.arange(self.slices.start, self.slices.stop) + 0.5, max(2 * self.fade, 1)
-        share = np.ones(at.size)
+        middles, width = np.arange(self.slices.start, self.slices.stop) + 0.5, max(2 * self.fade, 1)
+        share = np.ones(middles.size)
         if self.slices.start < self.own.start:
-            share *= np.clip((at - self.own.start) / width + 0.5, 0, 1)
+            share *= np.clip((middles - self.own.start) / width + 0.5, 0, 1)
         if self.own.stop < self.slices.stop:
-            share *= np.clip((self.own.stop - at) / width + 0.5, 0, 1)
+            share *= np.clip((self.own.stop - middles) / width + 0.5, 0, 1)
         return share.astype(np.float32)
 
 

@@ -72,9 +72,9 @@ def mirrored(values: NDArray[np.floating], axis_col: float) -> NDArray[np.floati
     from scipy.interpolate import make_interp_spline  # loading takes a quarter of a second
 
     cols = values.shape[-1]
-    at = 2 * axis_col - np.arange(cols)
+    mirror = 2 * axis_col - np.arange(cols)
     spline = make_interp_spline(np.arange(cols), values, 3, axis=-1)
-    return np.where((at >= 0) & (at <= cols - 1), spline(np.clip(at, 0, cols - 1)), np.nan)
+    return np.where((mirror >= 0) & (mirror <= cols - 1), spline(np.clip(mirror, 0, cols - 1)), np.nan)
 
 
 def without_layers(stripes: F32, axis_col: float) -> F32:

@@ -64,12 +64,12 @@ def geometry_of_vectors(vectors: ArrayLike, detector_shape: tuple[int, int], *, 
     pitch = float(np.median(sizes * apart[:, 0]))
     _require_pixels(u * apart, v * apart, frame, pitch, (rows, cols))
     foot = first + distances[:, None] * beam if cone else np.zeros_like(middle)  # the origin is projected to this point
-    at = np.stack((_dot(foot - middle, along_cols), _dot(foot - middle, along_rows)), 1) / sizes[:, None]
-    at += (cols - 1) / 2, (rows - 1) / 2
-    axis_col, axis_row = np.median(at, axis=0)
+    pixels = np.stack((_dot(foot - middle, along_cols), _dot(foot - middle, along_rows)), 1) / sizes[:, None]
+    pixels += (cols - 1) / 2, (rows - 1) / 2
+    axis_col, axis_row = np.median(pixels, axis=0)
     theta, roll, tilt = _angles(*frame)
     where = Where(
-        axis_col=axis_col, axis_row=axis_row, shifts=_clean(at - (axis_col, axis_row)), roll=roll, tilt=tilt
+        axis_col=axis_col, axis_row=axis_row, shifts=_clean(pixels - (axis_col, axis_row)), roll=roll, tilt=tilt
     )  # fmt: skip
     if not cone:
         return Geometry.parallel(theta, (rows, cols), pixel_pitch=pitch, **where)

@@ -278,14 +278,14 @@ class VolumeSeries:
 
     def each(self) -> list[Any]:
         """The volumes; each one reads its voxels only when it is sliced along z."""
-        return [_VolumeAt(self.data, at) for at in range(self.n)]
+        return [_VolumeAt(self.data, index) for index in range(self.n)]
 
 
 class _VolumeAt:
     """One volume of a dataset [time, z, y, x], as a dataset [z, y, x] that is read in slices along z."""
 
-    def __init__(self, data: Any, at: int) -> None:
-        self._data, self._at, self.shape, self.dtype = data, at, data.shape[1:], data.dtype
+    def __init__(self, data: Any, index: int) -> None:
+        self._data, self._at, self.shape, self.dtype = data, index, data.shape[1:], data.dtype
 
     def __getitem__(self, z: slice) -> NDArray[np.float32]:
         return np.asarray(self._data[self._at, z])

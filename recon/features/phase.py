@@ -75,8 +75,8 @@ class Paganin:
             gain *= 1 + weight * (1 - np.exp(-2 * (math.pi * sigma) ** 2 * f2))
         gain = gain.astype(np.float32)
         for view in views:
-            light = _filtered_light(view, gain)
-            np.negative(np.log(np.maximum(light, floor, out=light), out=light), out=view)
+            transmission = _filtered_transmission(view, gain)
+            np.negative(np.log(np.maximum(transmission, floor, out=transmission), out=transmission), out=view)
 
 
 def _squared_frequencies(views: F32) -> F64:
@@ -85,7 +85,7 @@ def _squared_frequencies(views: F32) -> F64:
     return along[0][:, None] + along[1]
 
 
-def _filtered_light(view: F32, gain: NDArray[np.floating]) -> F32:
+def _filtered_transmission(view: F32, gain: NDArray[np.floating]) -> F32:
     """The transmission of line integrals [row, col], with its cosine transform multiplied by `gain`."""
     from numba import config
 
@@ -159,7 +159,7 @@ def length_by_held_out_views(
         unseen, images = predicted_views(method, Views(filtered, geometry, weights), grid, _ONE_IN, decide)
         norms[:] = decide.made[NORM]
         fringes = (1 + (2 * math.pi) ** 2 * square * _squared_frequencies(views)).astype(np.float32)
-        off = np.stack([_filtered_light(image, fringes) for image in images]) - np.exp(-views[unseen])
+        off = np.stack([_filtered_transmission(image, fringes) for image in images]) - np.exp(-views[unseen])
         return np.sqrt(np.square(off[:, known]).mean(axis=1, dtype=np.float64))
 
     best = preferred_strength(residuals_of, _FIRST)

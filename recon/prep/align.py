@@ -274,8 +274,8 @@ def closest_pair(theta: Floats, tolerance: float) -> tuple[int, int] | None:
     order = np.argsort(np.mod(theta, 2 * np.pi))
     turned = np.mod(theta[order], 2 * np.pi)
     extended = np.concatenate([turned, turned + 2 * np.pi])
-    at = np.searchsorted(extended, turned + np.pi)
-    options = np.stack([np.clip(at - 1, 0, None), np.clip(at, None, extended.size - 1)])
+    index = np.searchsorted(extended, turned + np.pi)
+    options = np.stack([np.clip(index - 1, 0, None), np.clip(index, None, extended.size - 1)])
     miss = np.abs(extended[options] - turned - np.pi)
     side, first = np.unravel_index(int(miss.argmin()), miss.shape)
     if miss[side, first] > tolerance:

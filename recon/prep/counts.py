@@ -132,11 +132,11 @@ def line_integrals(counts: Counts) -> tuple[F32, F32]:
 def of_view(photons: F64, beam: F64, extra: F64) -> tuple[F64, F64]:
     """`line_integrals` of one projection [row, col], from the images of `Counts.photons`."""
     good = np.isfinite(photons) & (beam > 0)
-    light = np.where(good, beam, 1.0)
+    open_beam = np.where(good, beam, 1.0)
     level, smooth = _expected(np.where(good, photons, 0), np.where(good, beam, 0), np.where(good, extra, 0))
-    p, _ = expanded(np.where(good, photons, level), light, extra, -np.log(level / light))
+    p, _ = expanded(np.where(good, photons, level), open_beam, extra, -np.log(level / open_beam))
     # Weights that follow each ray's own noise would hide this noise from methods that whiten with them.
-    _, w = expanded(smooth, light, extra, -np.log(smooth / light))
+    _, w = expanded(smooth, open_beam, extra, -np.log(smooth / open_beam))
     return np.where(good, p, np.nan), np.where(good, w, 0)
 
 
@@ -158,11 +158,11 @@ def photon_transfer(flats: ArrayLike, darks: ArrayLike | None = None) -> tuple[f
     dark, dark_variance = (
         (np.zeros(1), np.zeros(1)) if darks is None else _mean_and_variance(darks, "darks", scaled=False)
     )
-    light, noise = bright - dark, bright_variance - dark_variance
-    lit = light > 0.1 * np.median(light)
+    signal, noise = bright - dark, bright_variance - dark_variance
+    lit = signal > 0.1 * np.median(signal)
     # Ratio of sums over the pixels in the beam, without the 1 % with the largest variances (hot pixels).
     lit &= bright_variance <= np.percentile(bright_variance, 99)
-    gain = float(noise[lit].sum() / light[lit].sum()) if lit.any() else 0.0
+    gain = float(noise[lit].sum() / signal[lit].sum()) if lit.any() else 0.0
     if not gain > 0:
         raise ValueError(
             "state the gain: it cannot be measured here, because the variance of the flats does not grow with their "

@@ -227,23 +227,23 @@ class CorrectionPlan:
 
     def _levelled(self, views: Transmission) -> Transmission:
         """Divide the projections by the level of their air columns, in place."""
-        light, columns = air_light(views.data, *self.air_columns), self.air_columns
-        unlit = views.view_ids[~(light.min(axis=1) > self.settings.floor)]
+        level, columns = air_light(views.data, *self.air_columns), self.air_columns
+        unlit = views.view_ids[~(level.min(axis=1) > self.settings.floor)]
         if unlit.size:
             raise UnlitViewsError(
-                f"leave out the projections without beam: {unlit.size} of {len(light)} ({unlit[:8].tolist()} ...). "
+                f"leave out the projections without beam: {unlit.size} of {len(level)} ({unlit[:8].tolist()} ...). "
                 f"Their air columns, {columns[0]} on the left and {columns[1]} on the right, are dark"
             )
-        views.data[...] /= light[:, None]
-        beam = None if views.beam is None else views.beam * light[:, None]
-        return replace(views, air=light.mean(axis=1), beam=beam)
+        views.data[...] /= level[:, None]
+        beam = None if views.beam is None else views.beam * level[:, None]
+        return replace(views, air=level.mean(axis=1), beam=beam)
 
     def _likelihood(self, view: Image, beam: Image) -> None:
         """Replace the transmission of a projection by line integrals, and the photons of its beam by weights."""
         assert self.photons is not None
-        light = beam.astype(np.float64)
+        open_beam = beam.astype(np.float64)
         extra = np.full(view.shape, self.photons.variance / self.photons.gain**2)
-        p, w = of_view(np.maximum(view * light, -extra), light, extra)
+        p, w = of_view(np.maximum(view * open_beam, -extra), open_beam, extra)
         view[...] = np.where(w > 0, p, 0)
         beam[...] = np.where(self.masked, 0, w)
 

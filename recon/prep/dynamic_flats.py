@@ -61,13 +61,13 @@ class DynamicFlats:
             view: float32 [row, col], counts minus dark.
             floor: lowest transmission; darker pixels are not used.
         """
-        light = np.divide(view, self.mean, out=np.zeros_like(self.mean), where=self.mean > 0)
-        known = light > floor
+        transmission = np.divide(view, self.mean, out=np.zeros_like(self.mean), where=self.mean > 0)
+        known = transmission > floor
         if not len(self.components) or known.mean() < _ENOUGH:
             return np.zeros(len(self.components), np.float32)
-        integral = -np.log(np.where(known, light, 1.0))
+        integral = -np.log(np.where(known, transmission, 1.0))
         # the noise of a line integral is proportional to the inverse of this
-        share = np.sqrt(np.where(known, light, 0))
+        share = np.sqrt(np.where(known, transmission, 0))
         targets, columns = [], []
         for axis in [axis for axis, size in enumerate(view.shape) if size > 1]:
             apart = min(_APART, view.shape[axis] - 1)
@@ -89,11 +89,13 @@ class DynamicFlats:
             air = known & (np.abs(smooth - np.percentile(smooth[known], _LOWEST)) < _AIR)
             if air.mean() < _ENOUGH:
                 return w
-            at = np.flatnonzero(air)[:: max(1, int(air.sum()) // _SAMPLED)]
-            matrix = np.column_stack((self.components.reshape(len(self.components), -1)[:, at].T, np.ones(at.size)))
-            weights = np.linalg.lstsq(matrix.astype(np.float64), -integral.ravel()[at].astype(np.float64), rcond=None)[
-                0
-            ]
+            pixels = np.flatnonzero(air)[:: max(1, int(air.sum()) // _SAMPLED)]
+            matrix = np.column_stack(
+                (self.components.reshape(len(self.components), -1)[:, pixels].T, np.ones(pixels.size))
+            )
+            weights = np.linalg.lstsq(
+                matrix.astype(np.float64), -integral.ravel()[pixels].astype(np.float64), rcond=None
+            )[0]
             weights, level = weights[:-1], weights[-1]
         left = integral + np.tensordot(weights, self.components, axes=1) + np.float32(level)
         smooth = scipy.ndimage.uniform_filter(left, _SMOOTHED, mode="nearest")

@@ -54,10 +54,10 @@ class LinesPlan:
         bad, runs, repaired = ~np.isfinite(data), [NO_RUNS], np.zeros(len(data), np.int64)
         hidden = np.zeros(data.shape[1:], np.bool_)
         for v, view in enumerate(data):
-            light = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
-            light[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
+            values = np.exp(-np.clip(view, -_DEEPEST, _DEEPEST))
+            values[(view == 0) & (np.mean(view < 0) > _NOISY)] = 0
             lost = bad[v]
-            if (unseen := unmeasured(view, light, hidden, self.foreign)) is not None:
+            if (unseen := unmeasured(view, values, hidden, self.foreign)) is not None:
                 runs.append(runs_of(unseen, int(view_ids[v])))
                 lost, repaired[v] = lost | unseen, -np.count_nonzero(lost & unseen)
             repaired[v] += np.count_nonzero(bad[v])

@@ -71,8 +71,8 @@ class Overshoot:
         """The same for counts [view, row, col], with dark and flat [row, col]; pixels without beam in the flat count as
         air."""
         beam = flat - dark
-        light = np.where(beam > 0, (counts - dark) / np.where(beam > 0, beam, 1), 1)
-        return cls.of(-np.log(np.maximum(light, 1e-6)).astype(np.float32))
+        transmission = np.where(beam > 0, (counts - dark) / np.where(beam > 0, beam, 1), 1)
+        return cls.of(-np.log(np.maximum(transmission, 1e-6)).astype(np.float32))
 
     def in_words(self) -> str:
         return (
@@ -90,13 +90,13 @@ def _overshoot(halves: F32) -> Overshoot:
         for way in (1, -1)
     ]
     rays, place = (np.concatenate(parts) for parts in zip(*edges, strict=True))
-    at = np.unique(place, return_inverse=True)[1]
-    places = int(at.max(initial=-1)) + 1
+    group = np.unique(place, return_inverse=True)[1]
+    places = int(group.max(initial=-1)) + 1
     if places < _FEWEST:
         return Overshoot()
     below = rays[:, 1 + _BESIDE :].mean(axis=1, dtype=np.float64)[:, None] - rays
     mean = below.mean(axis=0)
-    scatter = np.square([np.bincount(at, column) for column in (below - mean).T]).sum(axis=1) * places / (places - 1)
+    scatter = np.square([np.bincount(group, column) for column in (below - mean).T]).sum(axis=1) * places / (places - 1)
     errors = np.sqrt(scatter[1 : 1 + _BESIDE]) / len(below) + 1e-9
     noise = np.sqrt(2 * scatter[1 + _BESIDE :].mean()) / len(below) + 1e-9  # compared with the mean of three columns
     by_noise = np.where(mean[1 : 1 + _BESIDE] > _AGREE * errors, mean[1 : 1 + _BESIDE] / noise, 0)
@@ -114,9 +114,9 @@ def _edges(sought: F32, measured: F32, kind: int) -> tuple[F32, I64]:
     """
     sought = sought - sought[:, :, :_AIR].mean(axis=2, keepdims=True)
     threshold = _EDGE * deviation_between_neighbours(sought[:, :, :_AIR])
-    matter = sought > max(threshold, _OF_DEEPEST * float(np.percentile(sought, 98)))
-    view, row = np.nonzero(~matter[:, :, : _AIR + 1].any(axis=2) & matter[:, :, : sought.shape[2] // 2].any(axis=2))
-    first = matter[view, row].argmax(axis=1)
+    material = sought > max(threshold, _OF_DEEPEST * float(np.percentile(sought, 98)))
+    view, row = np.nonzero(~material[:, :, : _AIR + 1].any(axis=2) & material[:, :, : sought.shape[2] // 2].any(axis=2))
+    first = material[view, row].argmax(axis=1)
     around = np.take_along_axis(sought[view, row], first[:, None] + np.arange(-2, 3), axis=1)
     first = first - 1 + np.diff(around, axis=1).argmax(axis=1)  # the steepest step near the start of the material
     rays = np.take_along_axis(measured[view, row], first[:, None] + np.arange(1, -_AIR - 1, -1), axis=1)

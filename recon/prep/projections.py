@@ -47,9 +47,9 @@ class Projections:
     def lit(self) -> Mask | None:
         """bool [view, row, col], pixels with data; None: all have data, except lines, which are interpolated."""
         lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
-        at = {int(view): number for number, view in enumerate(self.view_ids)}
+        index_of = {int(view): number for number, view in enumerate(self.view_ids)}
         for view, row, first, end in self.unmeasured[np.isin(self.unmeasured[:, 0], self.view_ids)].tolist():
-            lit[at[view], row, first:end] = False
+            lit[index_of[view], row, first:end] = False
         return None if lit.all() else lit
 
     @property
@@ -76,9 +76,9 @@ def merge_and_empty(parts: list[Projections], data: NDArray[np.float32] | None =
     each = [part.weights for part in parts if part.weights is not None]
     counted = np.concatenate(each) if each else None
     if data is None:
-        data, at = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
+        data, start = np.empty((len(ids), *last.data.shape[1:]), np.float32), 0
         while parts:
             part = parts.pop(0).data
-            data[at : at + len(part)] = part
-            at += len(part)
+            data[start : start + len(part)] = part
+            start += len(part)
     return Projections(data, ids, floored, air, last.masked, last.air_columns, replaced, counted, runs, last.spots_left)

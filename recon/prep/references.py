@@ -45,10 +45,10 @@ class References:
 
     def __post_init__(self) -> None:
         some = np.ma.filled(self.flats[0][1], 0) if isinstance(self.flats, tuple) and self.flats else np.zeros(0)
-        light = float(np.nanpercentile(some, _BRIGHT)) if np.size(some) else 0.0
-        object.__setattr__(self, "dark", _mean(self.dark, "darks", light))
+        beam = float(np.nanpercentile(some, _BRIGHT)) if np.size(some) else 0.0
+        object.__setattr__(self, "dark", _mean(self.dark, "darks", beam))
         check_settings(self)
-        flats = tuple((position, _mean(flat, f"flats at {position:g}", light)) for position, flat in self.flats)
+        flats = tuple((position, _mean(flat, f"flats at {position:g}", beam)) for position, flat in self.flats)
         object.__setattr__(self, "flats", flats)
 
     def rows(self, rows: slice) -> References:
@@ -58,14 +58,14 @@ class References:
         return replace(self, dark=self.dark[rows], flats=flats, dynamic=dynamic)
 
 
-def _mean(frames: Image, what: str, light: float) -> Image:
+def _mean(frames: Image, what: str, beam: float) -> Image:
     """The mean of a stack, or a single image unchanged; NaN for pixels that are masked in all frames."""
     if np.ndim(frames) != 3:
         return cast(Image, without_mask(frames))
     if not len(frames):
         raise ValueError(f"the stack of {what} is empty; give at least one frame [frame, row, col]")
     if not np.ma.is_masked(frames):
-        frames = np.stack([frame for frame, _ in without_spots(without_mask(frames), light)])
+        frames = np.stack([frame for frame, _ in without_spots(without_mask(frames), beam)])
     return np.asarray(without_mask(np.mean(frames, axis=0, dtype=np.float64)), np.float32)
 
 
@@ -80,10 +80,10 @@ def check(references: References) -> None:
                 f"the dark has shape {shape}, the flat at {position:g} has {np.shape(flat)}; both must have the same "
                 "shape"
             )
-    at = sorted(p for p, _ in references.flats)
-    if len(set(at)) < len(at) or not np.isfinite(at).all():
+    positions = sorted(p for p, _ in references.flats)
+    if len(set(positions)) < len(positions) or not np.isfinite(positions).all():
         raise ValueError(
-            f"each group of flats needs a position of its own, got {at}; average the flats that were taken together"
+            f"each group of flats needs a position of its own, got {positions}; average flats that belong together"
         )
 
 
@@ -107,11 +107,11 @@ def flat_at(position: float, groups: Sequence[tuple[float, Image]], part_starts:
     part = bisect_right(part_starts, position)
     own = [group for group in groups if bisect_right(part_starts, group[0]) == part]
     groups = own or [min(groups, key=lambda group: abs(group[0] - position))]
-    at = [p for p, _ in groups]
-    upper = int(np.searchsorted(at, position))
+    positions = [p for p, _ in groups]
+    upper = int(np.searchsorted(positions, position))
     if upper == 0 or upper == len(groups):
         return groups[min(upper, len(groups) - 1)][1]
-    weight = np.float32((position - at[upper - 1]) / (at[upper] - at[upper - 1]))
+    weight = np.float32((position - positions[upper - 1]) / (positions[upper] - positions[upper - 1]))
     return groups[upper - 1][1] * (1 - weight) + groups[upper][1] * weight
 
 
@@ -154,7 +154,7 @@ def dead_pixels(dark: Image, flats: Sequence[Image], hot_threshold: float = 10.0
     return dead | hot
 
 
-def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
+def shadowed(transmission: NDArray[np.float32], floor: float = 1e-4) -> Mask:
     """Mask [row, col] of areas with beam in the flats but in no projection: a part of the instrument is in the beam.
 
     Only runs of dark pixels from an edge of their row count, and rows that are completely dark. An opaque rod on the
@@ -166,11 +166,11 @@ def shadowed(light: NDArray[np.float32], floor: float = 1e-4) -> Mask:
         light: float32 [view, row, col], transmission of at least three projections from all directions.
         floor: lowest transmission that counts as beam.
     """
-    n = len(light)
-    middle = np.median(light, axis=0)
-    spread = np.median(np.abs(light - middle), axis=0) / MEDIAN
+    n = len(transmission)
+    middle = np.median(transmission, axis=0)
+    spread = np.median(np.abs(transmission - middle), axis=0) / MEDIAN
     dark = middle < np.maximum(floor, _SURE * spread / np.sqrt(n))
-    bright = np.partition(light, n - 2, axis=0)[n - 2]  # one projection may have a zinger
+    bright = np.partition(transmission, n - 2, axis=0)[n - 2]  # one projection may have a zinger
     dark &= bright < _DIM
     whole = dark.mean(axis=1) > _WHOLE  # a row that the camera does not read has no blurred edge
     block = np.ones((3, 3))
@@ -239,9 +239,9 @@ def edge_depth(profiles: F32, positions: NDArray[np.int64], flats: Sequence[floa
         columns: number of columns that show air, left and right.
     """
     sides = [side for side, n in enumerate(columns) if n]
-    light = np.median(profiles[:, sides, :, :_OUTER], axis=(1, 2, 3))
+    levels = np.median(profiles[:, sides, :, :_OUTER], axis=(1, 2, 3))
     beside = (np.argsort(np.abs(positions - flat), kind="stable")[:_NEXT] for flat in flats)
-    depth = min(-math.log(max(float(np.median(light[views])), 1e-30)) for views in beside)
+    depth = min(-math.log(max(float(np.median(levels[views])), 1e-30)) for views in beside)
     outer, inner = (np.median(part, axis=(0, 2, 3)) for part in (profiles[..., :_OUTER], profiles[..., -_OUTER:]))
     rises = np.log(np.maximum(outer, 1e-30) / np.maximum(inner, 1e-30))[sides]
     return depth if rises.min() > _RISE else 0.0

@@ -86,8 +86,8 @@ def _sums(
 ) -> Iterator[tuple[F64, F64, float, float, int]]:
     """Sums for each band of rows: normal equations of the changes, squares of difference and structure, pixels."""
     (first, later), axis = pair, (geometry.axis_col + 0.5) / side - 0.5
-    at = min(later, len(data) - 2)
-    beside = data[[first, later, at - 1, at, at + 1]]
+    second = min(later, len(data) - 2)
+    beside = data[[first, later, second - 1, second, second + 1]]
     view, seen, before, near, after = (
         gaussian_filter(image.astype(np.float64), _SMOOTH, mode="nearest") for image in bin_views(beside, side)
     )

@@ -91,26 +91,26 @@ def line_through(candidates: F64, curves: F64, heights: F64) -> TiltEstimate:
     for slope in range(-most, most + 1):
         shifts = np.rint(slope * heights / far).astype(int) + most
         total = sum(curve[shift : shift + n] for curve, shift in zip(padded, shifts, strict=True))
-        at = int(np.argmin(total))
-        if total[at] < lowest:
-            best, lowest = (slope, at), float(total[at])
-    slope, at = best
+        index = int(np.argmin(total))
+        if total[index] < lowest:
+            best, lowest = (slope, index), float(total[index])
+    slope, index = best
     typical = float(np.median(np.log(curves).sum(axis=0)))
-    if abs(slope) == most or not 0 < at < n - 1 or typical - lowest < _DEEP * heights.size:
+    if abs(slope) == most or not 0 < index < n - 1 or typical - lowest < _DEEP * heights.size:
         raise ValueError("no clear optimum")
     from scipy.interpolate import CubicSpline  # loading takes half a second
 
     splines = [CubicSpline(candidates, np.log(curve)) for curve in curves]
-    every, start = np.arange(heights.size), np.array([candidates[at], slope * step / far])
+    every, start = np.arange(heights.size), np.array([candidates[index], slope * step / far])
     line = _best_line(splines, heights, every, start)
     variances = []
     for count in (heights.size, max(FEWEST_BANDS, heights.size // 3)):
         parts = np.array_split(every, count)
         slopes = [_best_line(splines, heights, np.setdiff1d(every, part), line)[1] for part in parts]
         variances.append((count - 1) * np.var(slopes))
-    at = line[0] + line[1] * heights
-    near = np.clip(at[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1), candidates[0], candidates[-1])
-    own = np.array([x[np.argmin(spline(x))] for spline, x in zip(splines, near, strict=True)]) - at
+    index = line[0] + line[1] * heights
+    near = np.clip(index[:, None] + np.linspace(-_OWN, _OWN, 20 * _OWN + 1), candidates[0], candidates[-1])
+    own = np.array([x[np.argmin(spline(x))] for spline, x in zip(splines, near, strict=True)]) - index
     scatter = float(np.median(np.abs(own))) * _SIGMAS / math.sqrt(float(((heights - heights.mean()) ** 2).sum()))
     uncertainty = math.hypot(math.sqrt(max(variances)), scatter)
     return TiltEstimate(math.atan(line[1]), uncertainty / (1 + line[1] ** 2), float(line[0]))

@@ -174,8 +174,8 @@ def mean_change(
     data = first_volume(projections, geometry, slab, device=device).data if known is None else known.data[middle]
     lines = volume_lines(np.maximum(data, 0))
     unit = density_unit(lines)
-    matter = np.count_nonzero(lines > MATTER * unit)
-    return float(total_variation(lines, difference_weights(slab)) / (matter * unit)) if matter else 0.0
+    in_sample = np.count_nonzero(lines > MATTER * unit)
+    return float(total_variation(lines, difference_weights(slab)) / (in_sample * unit)) if in_sample else 0.0
 
 
 def _swept(geometry: Geometry, start: Start) -> bool:

@@ -148,11 +148,11 @@ def _halves(log_scales: F32, rotations: F32) -> tuple[F32, F32, F32, float]:
         Shifts of the first and the second halves [n, 3] mm, the values to add to their log scales [n, 3], and the
         divisor of their density.
     """
-    at, axis = np.arange(len(log_scales)), log_scales.argmax(axis=1)
-    apart, shrink = APART * np.exp(log_scales[at, axis]), math.sqrt(1 - APART**2)
-    offset = (apart[:, None] * rotations[at, :, axis]).astype(np.float32)
+    index, axis = np.arange(len(log_scales)), log_scales.argmax(axis=1)
+    apart, shrink = APART * np.exp(log_scales[index, axis]), math.sqrt(1 - APART**2)
+    offset = (apart[:, None] * rotations[index, :, axis]).astype(np.float32)
     narrower = np.zeros_like(log_scales)
-    narrower[at, axis] = math.log(shrink)
+    narrower[index, axis] = math.log(shrink)
     return offset, -offset, narrower, 2 * shrink
 
 

@@ -88,14 +88,14 @@ class MethodConformance:
         assert np.abs(found - expected).mean() < 0.2 * np.abs(expected).mean()
 
     def test_it_tells_how_far_it_is_and_stops_when_it_is_asked_to(self, method: Method) -> None:
-        told: list[int] = []
-        control = RunControl(should_stop=lambda: True, on_progress=lambda progress: told.append(progress.step))
+        steps: list[int] = []
+        control = RunControl(should_stop=lambda: True, on_progress=lambda progress: steps.append(progress.step))
         result = method.run(problem(), control)
         assert result.volume.data.shape == GRID.shape
         if not method.fitted:
             assert result.history == ()
         else:
-            assert told and result.history
+            assert steps and result.history
             assert result.history[-1].step <= 2  # it stopped before the third step
 
     def test_its_toy_runs_and_its_memory_grows_with_the_volume(self, method: Method) -> None:

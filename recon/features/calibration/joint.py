@@ -286,9 +286,13 @@ def _solved(
     typical = float(np.vdot(seen, weighed(seen)) / max(float(np.vdot(first, first)), 1e-30))
     scale: dict[str, NDArray[np.float64]] = {}
     for name, slope in free.items():
-        told = np.einsum("vcr,vcr->v", slope, weighed(slope)).astype(np.float64)
-        told = np.maximum(told, _FLOOR * np.median(told)) if name in ("col", "row") else told.sum(keepdims=True)
-        scale[name] = np.sqrt(typical / np.maximum(told, 1e-30))
+        information = np.einsum("vcr,vcr->v", slope, weighed(slope)).astype(np.float64)
+        information = (
+            np.maximum(information, _FLOOR * np.median(information))
+            if name in ("col", "row")
+            else information.sum(keepdims=True)
+        )
+        scale[name] = np.sqrt(typical / np.maximum(information, 1e-30))
 
     def back(images: F32) -> tuple[F32, dict[str, F64]]:
         values = {}

@@ -111,14 +111,14 @@ class LearntGeometry:
 
     def in_words(self, binning: int = 1) -> str:
         """The result as a sentence, in unbinned pixels."""
-        told = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
+        changes = ", ".join(_text(self.change, term, binning) for term in self.confirmed)
         if not (self.confirmed or self.dropped):
             return "Geometry: unchanged, because the projections show no error that matters."
         kept = f"{', '.join(self.dropped)}: unchanged, because held-out projections do not confirm a change."
-        if not told:
+        if not changes:
             return f"Geometry: {kept}"
         first = (
-            f"Geometry calibrated: {told}. The deviation of held-out projections fell from {self.before:.4g} to "
+            f"Geometry calibrated: {changes}. The deviation of held-out projections fell from {self.before:.4g} to "
             f"{self.after:.4g}."
         )
         return f"{first} {kept[0].upper()}{kept[1:]}" if self.dropped else first

@@ -81,20 +81,20 @@ def fitted_levels(values: F32, count: int) -> tuple[F64, F64]:
     few = some_values(values, _LOOKED_AT)
     few = few[few >= EMPTY * np.percentile(few, 99.5)]
     counts, edges = np.histogram(few, _BINS, range=tuple(np.percentile(few, (0.05, 99.95))))
-    at, quantiles = (edges[1:] + edges[:-1]) / 2, (np.arange(count) + 0.5) / count
+    middles, quantiles = (edges[1:] + edges[:-1]) / 2, (np.arange(count) + 0.5) / count
     mean = np.quantile(few, quantiles if count > 2 else (0.1, 0.9)).astype(float)
-    span, weight = float(np.ptp(at)), np.full(count + 1, 1 / (count + 1))
+    span, weight = float(np.ptp(middles)), np.full(count + 1, 1 / (count + 1))
     deviation = np.full(count, span / 6)
     for _ in range(_ROUNDS):
-        z = (at - mean[:, None]) / deviation[:, None]
+        z = (middles - mean[:, None]) / deviation[:, None]
         normal = weight[:count, None] / deviation[:, None] * np.exp(-0.5 * z**2)
-        inside = (at > mean.min()) & (at < mean.max())
+        inside = (middles > mean.min()) & (middles < mean.max())
         flat = weight[count] * math.sqrt(2 * math.pi) * inside / (np.ptp(mean) + 1e-6 * span) + 1e-12 / span
         share = np.vstack((normal, flat))
         share *= counts / share.sum(0)
         n = share.sum(1) + 1e-9
-        weight, mean = n / n.sum(), share[:count] @ at / n[:count]
-        deviation = np.sqrt((share[:count] * (at - mean[:, None]) ** 2).sum(1) / n[:count])
+        weight, mean = n / n.sum(), share[:count] @ middles / n[:count]
+        deviation = np.sqrt((share[:count] * (middles - mean[:, None]) ** 2).sum(1) / n[:count])
         deviation = deviation.clip(1e-3 * span, max(0.15 * float(np.ptp(mean)), 1e-3 * span))
     order = np.argsort(mean)
     return mean[order], weight[:count][order] / weight[:count].sum()

@@ -278,9 +278,9 @@ def of_moments(views: TimedViews, times: F64, most: int) -> tuple[EnergyViews, F
     moments = min(most, n)
     moment = np.empty(n, np.intp)
     moment[np.argsort(views.times, kind="stable")] = np.arange(n) * moments // n
-    at = np.bincount(moment, views.times) / np.bincount(moment)
+    middles = np.bincount(moment, views.times) / np.bincount(moment)
     shares = np.zeros((moments, times.size))
     np.add.at(shares, moment, hats(views.times, times))
     shares /= np.bincount(moment)[:, None]
-    past = (at - times[0]) / np.ptp(times)
+    past = (middles - times[0]) / np.ptp(times)
     return EnergyViews(views.projections, views.geometry, moment, shares, views.weight), past

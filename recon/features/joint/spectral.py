@@ -104,9 +104,9 @@ def fit_materials(
     return Materials(densities, grid, weights, residual)
 
 
-def weight_of(light: F32) -> F32:
+def weight_of(transmission: F32) -> F32:
     """Weights, up to 1, of rays with this transmission."""
-    return np.clip(light / _LITTLE, _LEAST, 1)
+    return np.clip(transmission / _LITTLE, _LEAST, 1)
 
 
 def _weighed(views: EnergyViews) -> EnergyViews:
@@ -117,11 +117,11 @@ def _weighed(views: EnergyViews) -> EnergyViews:
     iterations.
     """
     there = np.ones_like(views.projections) if views.weight is None else (views.weight > 0).astype(np.float32)
-    light = np.empty_like(there)
+    transmission = np.empty_like(there)
     for view, image in enumerate(views.projections):
         near = gaussian_filter(there[view], _AVERAGED)
-        light[view] = np.exp(-gaussian_filter(there[view] * image, _AVERAGED) / np.maximum(near, 1e-3))
-    weight = weight_of(light)
+        transmission[view] = np.exp(-gaussian_filter(there[view] * image, _AVERAGED) / np.maximum(near, 1e-3))
+    weight = weight_of(transmission)
     if views.weight is not None:
         weight *= np.minimum(1, views.weight / (_LITTLE * (float(views.weight.max()) or 1)))
     return replace(views, weight=weight.astype(np.float32))

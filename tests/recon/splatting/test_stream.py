@@ -173,7 +173,7 @@ def test_bad_views_are_refused_and_leave_the_model_alone(data: np.ndarray) -> No
     assert model.n_views == 0
     with pytest.raises(ValueError, match="at least one Gaussian"):
         StreamingFit(VIEWS, GRID, gaussians=0)
-    with pytest.raises(ValueError, match="no view"):
+    with pytest.raises(ValueError, match="no projection"):
         model.finish(0.1)
 
 

@@ -80,7 +80,7 @@ def test_errors_say_what_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ValueError, match="devices, got cpu"):
         gpu.require("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(RuntimeError, match="sees no CUDA device"):
+    with pytest.raises(RuntimeError, match="finds no CUDA device"):
         gpu.require("cuda:1")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
