@@ -1,4 +1,4 @@
-"""The clock of tests: the same number of steps on any machine."""
+"""A clock for tests: it counts steps, so that it is the same on any machine."""
 
 import time
 from collections.abc import Callable

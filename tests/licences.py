@@ -1,4 +1,4 @@
-"""Licences of all that an installation brings, from the metadata of what is installed here; writes docs/licences.md.
+"""Writes docs/licences.md: the licences of all installed packages, from their metadata.
 
 python -m tests.licences        # in an environment with all extras
 

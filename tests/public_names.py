@@ -1,4 +1,4 @@
-"""The public names and what each must be given, from the modules themselves; writes docs/public_names.md.
+"""Writes docs/public_names.md: the public names and their required parameters, from the modules.
 
 python -m tests.public_names        # in an environment with all extras
 

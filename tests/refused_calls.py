@@ -1,4 +1,4 @@
-"""Calls that are refused, and what they say: a text file beside a test module, test_it.refused.txt beside test_it.py.
+"""Calls that raise an error, with their messages, in a text file test_it.refused.txt next to test_it.py.
 
 It begins with imports. Then there are two lines for each call, and an empty line:
 

@@ -1,4 +1,4 @@
-"""Small scans with a known answer: two cylinders along the rotation axis, seen by exact chords."""
+"""Small scans with a known answer: two cylinders along the rotation axis, projected with exact chords."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

@@ -1,4 +1,4 @@
-"""Transcripts: command lines, and what the command says where it refuses.
+"""Transcripts: command lines that end with an error, with their exit codes and messages.
 
 A transcript is a text file of blocks, with an empty line between two:
 

@@ -1,4 +1,4 @@
-"""Clean scans: 240 of many kinds through all judgements of a reconstruction and of `info`.
+"""Clean scans: 240 of many kinds, run through all judgements of a reconstruction and of `info`.
 
 python -m tests.bench.clean_scans [FIRST [STOP]] prints every warning, and ends with 1 if there is one that no property
 of the scan explains (few views, a sample wider than the field and so on; see EXPLAINED).

@@ -1,4 +1,4 @@
-"""The first users' league: packed samples of many columns from few views, in the field and wider, by ours and peers.
+"""Benchmark of the first users' scan: packed samples from few projections, with our methods and other packages.
 
 python -m tests.bench.first_users SCORES.json --columns 512 --views 90 --best > tables.md
 adds what SCORES.json lacks, a volume at a time, and prints the tables of all cells asked for. Several calls may add to

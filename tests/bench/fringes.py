@@ -1,4 +1,4 @@
-"""Fringes behind cathodes: dB and CPU seconds by default, by no filter, by the filter of the truth, and by that chosen.
+"""Phase fringes of cathodes: dB and CPU seconds by default, without a filter, with the right and the chosen filter.
 
     python -m tests.bench.fringes [--seeds 0,100] [--method fista-tv]
 

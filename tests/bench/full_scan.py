@@ -1,4 +1,4 @@
-"""Makes a scan of full size, and judges the volume made of it.
+"""Makes a scan of full size and measures the quality of its volume.
 
     python tests/bench/full_scan.py make FOLDER [SIDE VIEWS]
     beamline recon FOLDER/scan.tif -m fbp --quantity line-integrals --angles FOLDER/angles.txt --axis C ...

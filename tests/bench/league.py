@@ -1,4 +1,4 @@
-"""A league: our methods and every peer that is installed, on the same scans, by default and by the best setting.
+"""Benchmark: our methods and all installed packages on the same scans, with default and best settings.
 
 python -m tests.bench.league SCORES.json [--scans "bone;Diamond"] [--of svmbir] [--small] > table.md
 adds scores to the file, and prints the table of all that are in it. pip install ".[league]" brings the peers that need

@@ -1,4 +1,4 @@
-"""Who plays in the league: our methods and peers, each by default first, then by other values of its main setting.
+"""The methods of the benchmark: ours and other packages, each with its default and other values of its main setting.
 
 A volume is [z, y, x] in 1/pixel. The second axis of the peers' volumes runs against ours. A setting that does not take
 a geometry on the CPU raises NotImplementedError.

@@ -1,4 +1,4 @@
-"""The next pass: what a scan's volume gains by each pass, and how few frames the best choice in hindsight takes.
+"""The next pass: the gain of each pass, and the fewest frames of the best choice, known afterwards.
 
 python -m tests.bench.next_pass SCORES.json --scenes 0,1,2
 adds the volumes that SCORES.json lacks, and prints a table. Several calls may add to one file at once.

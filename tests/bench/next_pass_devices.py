@@ -1,4 +1,4 @@
-"""The scenes of next_pass as whole scans with simulated devices and a virtual clock, which decide for themselves.
+"""The scenes of next_pass as complete scans with simulated devices and a virtual clock, which decide themselves.
 
 python -m tests.bench.next_pass_devices FOLDER --scenes 0,2,4,5
 runs `beamline scan` with `scan.decide: do` in FOLDER, and prints what the file says: decisions, frames, and the real

@@ -1,4 +1,4 @@
-"""Scans that decide after each pass, on the curves of next_pass: what `do` chooses, and what it reaches.
+"""Scans that decide after each pass, on the curves of next_pass: the choices of `do`, and the result.
 
 python -m tests.bench.next_pass_policy SCORES.json --scenes 0,1,2 --seeds 0,1,2
 adds the laws and volumes that SCORES.json lacks, and prints the tables; see next_pass for both.

@@ -1,4 +1,4 @@
-"""Twenty frozen scenes of scans in passes: ten to build on, ten to look at once.
+"""Twenty fixed scenes of scans in passes: ten for development, ten to be used once.
 
 Lengths are in pixels of the detector, which are as wide as voxels, and densities in 1/pixel. 128 columns x 8 rows, 720
 views over half a turn in 8 interlaced passes, line integrals as means of nine rays of a pixel, the noise of so many

@@ -1,4 +1,4 @@
-"""Scans for quality tables: real volumes seen by a cone as in the published protocol, a measured walnut, a battery.
+"""Scans for quality tables: real volumes in a cone as in the published protocol, a measured walnut, a battery.
 
 The published protocol (Zha et al. 2024): DSO 5, DSD 7, a detector of 4 x 4 of 512² pixels, the volume a cube of edge 2
 with 256³ voxels; Poisson noise of 1e5 photons plus normal noise of 10 on views scaled to a largest value of 1. Half the

@@ -1,4 +1,4 @@
-"""Whole commands by width: CPU and wall seconds a slice, the peak of memory beside the plan's, PSNR to the truth.
+"""Whole commands by detector width: CPU and wall seconds per slice, peak and planned memory, PSNR.
 
     python tests/bench/size_table.py FOLDER METHOD COLUMNS [ROWS VIEWS LIMIT OPTION ...]
 

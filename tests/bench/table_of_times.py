@@ -1,4 +1,4 @@
-"""The first minute and the first second: a table of whole commands, several runs of each checkout in turn.
+"""Start-up times: a table of whole commands, several runs of each checkout in turn.
 
     python tests/bench/table_of_times.py FOLDER [CHECKOUT ...] [--runs 5] [--only WORD] [--only WORD]
 

@@ -1,4 +1,4 @@
-"""Ellipsoids seen along the exact rays of any geometry: views and volume with a known answer, without voxels."""
+"""Ellipsoids projected with the exact rays of any geometry: projections and volume with a known answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaussians as leaves of a graph, for gradient comparisons; and many steps of a fit."""
+"""Gaussians as leaves of a torch graph, for gradient comparisons; and many steps of a fit."""
 
 from __future__ import annotations
 

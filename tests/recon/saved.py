@@ -1,4 +1,4 @@
-"""What `Reconstruction.save` writes, compared with what `load` gives back."""
+"""Compares what `Reconstruction.save` writes with what `load` reads."""
 
 from __future__ import annotations
 

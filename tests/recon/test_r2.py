@@ -1,4 +1,4 @@
-"""R2 by the public call: starts and ends of fits, views held out, checkpoints, each beam and likelihood."""
+"""R2 through the public call: start and end of fits, held-out projections, checkpoints, all beams and likelihoods."""
 
 from __future__ import annotations
 

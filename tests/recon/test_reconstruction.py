@@ -1,4 +1,4 @@
-"""The public call: both methods, better than the baseline, honest about bad input."""
+"""The public call: both methods are better than the baseline, and bad input is an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a point falls on the detector, by trigonometry alone."""
+"""Where a point falls on the detector, computed with trigonometry alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scan that grows while it is followed: both share one clock of the test's, so that nothing waits for real."""
+"""A scan that grows while it is followed; both use the test's clock, so that nothing waits in real time."""
 
 from __future__ import annotations
 

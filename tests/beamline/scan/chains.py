@@ -1,4 +1,4 @@
-"""Runs whose parts end one after the other, and what their files must have."""
+"""Runs whose parts end one after another, and the required content of their files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A program for test_every_write.py: it writes and recovers scans, each time with another write that fails or kills.
+"""A program for test_every_write.py: writes and recovers scans; each time another write fails or kills it.
 
 It is started under the library of tests/faulty_disk.py, forks once for each fault, and prints a JSON object a line.
 Many faults leave the same bytes behind: what the commands make of these is looked at once. Each state that is left is

@@ -1,4 +1,4 @@
-"""The tables of docs/file_layout.md, and what files hold, for tests that compare them."""
+"""The tables of docs/file_layout.md and the content of files, for tests that compare them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must hold after any fault: one error with all its parts, an instrument at rest, a file, and the next scan."""
+"""What must hold after any fault: one complete error, an instrument at rest, a file, and a working next scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Metrics against closed forms and against skimage."""
+"""Metrics compared with closed forms and with skimage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Geometry: that choosing, cutting and binning keep every ray where it was, and that nothing of it is lost."""
+"""Geometry: selecting, cropping and binning keep every ray at its position."""
 
 from __future__ import annotations
 

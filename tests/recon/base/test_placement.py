@@ -1,4 +1,4 @@
-"""Placement of views: what is left out, and what is refused."""
+"""Placement of projections: defaults and errors."""
 
 from __future__ import annotations
 

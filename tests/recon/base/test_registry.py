@@ -1,4 +1,4 @@
-"""What other packages add to a registry, and what is left out with a warning."""
+"""Additions of other packages to a registry, and additions that are left out with a warning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Geometries of vectors: against rays traced by the vectors alone, and back to the vectors."""
+"""Geometries from vectors: compared with rays traced with the vectors, and converted back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The box of a fit: it holds what the views see however they are shifted, whatever volume is wanted of it."""
+"""The box of a fit contains everything that projections see, however they are shifted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Curves of beam hardening: what several energies do to line integrals is undone."""
+"""Beam-hardening curves: the effect of several energies on line integrals is corrected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Paganin's filter: it undoes what a wave's way to the detector does to a sample of one material."""
+"""Paganin's filter: it reverses the effect of free-space propagation for a sample of one material."""
 
 from __future__ import annotations
 

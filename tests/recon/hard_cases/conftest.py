@@ -1,4 +1,4 @@
-"""The kernels that a hard case runs on. Files that use them say `slow`: a run of slow tests skips those that do not."""
+"""The kernels for a hard case. Files that use them say `slow`: a run of slow tests skips those that do not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a hard case runs: the CPU's kernels, or Triton's (on CUDA where there is one, else interpreted and small)."""
+"""Where a hard case runs: the CPU kernels, or Triton's (on CUDA if there is one, otherwise interpreted and small)."""
 
 from __future__ import annotations
 

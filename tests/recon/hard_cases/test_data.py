@@ -1,4 +1,4 @@
-"""Difficult data: nothing, constants, counts of 0 and saturated, values that are not finite, few and odd views."""
+"""Difficult data: empty, constant, zero or saturated counts, values that are not finite, few projections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reference implementation, written to be read: the fast kernels for Gaussians are tested against it.
+"""Reference implementation, written for reading; the fast kernels for Gaussians are compared with it.
 
 Projection and voxelisation are dense float64 sums over all Gaussians:
 

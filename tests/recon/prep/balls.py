@@ -1,4 +1,4 @@
-"""Balls, seen by exact chords on a detector that may be turned about the beam: views and volume with a known answer."""
+"""Balls projected with exact chords on a detector that may be rotated about the beam."""
 
 from __future__ import annotations
 

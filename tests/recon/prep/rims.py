@@ -1,4 +1,4 @@
-"""Views of a can of balls with air beside it, by exact chords, with the fringes that transport of light gives them."""
+"""Projections of a can of balls next to air (exact chords), with the phase fringes of propagation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How strong the rings of a slice are."""
+"""Measures the strength of the rings in a slice."""
 
 from __future__ import annotations
 

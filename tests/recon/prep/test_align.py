@@ -1,4 +1,4 @@
-"""The rotation axis against closed-form sinograms with a known axis, and against real scans."""
+"""The rotation axis in closed-form sinograms with a known axis, and in real scans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rotation axis by the ends of half a turn: samples wider than the field, and scans whose ends show nothing."""
+"""The axis from the ends of a 180° scan: samples wider than the field, and scans whose ends show nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Counts to line integrals: Beer-Lambert comes back, and nothing bad gets through or spreads."""
+"""Counts to line integrals: Beer-Lambert is recovered, and bad values neither pass nor spread."""
 
 from __future__ import annotations
 

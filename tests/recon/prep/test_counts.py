@@ -1,4 +1,4 @@
-"""Counts: their likelihood as line integrals and weights; the estimate of photons."""
+"""Photon counts: their likelihood as line integrals and weights; the estimate of the gain."""
 
 from __future__ import annotations
 

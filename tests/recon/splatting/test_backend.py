@@ -1,4 +1,4 @@
-"""The CPU backend keeps the protocol's promises: copies, shared memory, sums; and which device gets which backend."""
+"""The CPU backend follows the protocol: copies, shared memory, sums; and which device gets which backend."""
 
 from __future__ import annotations
 

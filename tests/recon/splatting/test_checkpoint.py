@@ -1,4 +1,4 @@
-"""A checkpoint brings a fit back to the bit, and says what is wrong with one that cannot."""
+"""A checkpoint restores a fit bit for bit; an invalid one is reported with its error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a volume to Gaussians: they sit in the matter, explain the data's scale, and refuse what is not a volume."""
+"""From a volume to Gaussians: they are in the sample, match the scale of the data; wrong volumes are errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fit as a whole: it converges, repeats bit for bit, and its gradient is the loss's slope."""
+"""The fit as a whole: it converges, repeats bit for bit, and its gradient is that of the loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The data of a fit: units, weights, noise, binned pixels, views that come later."""
+"""The data of a fit: units, weights, noise, binned pixels, later projections."""
 
 from __future__ import annotations
 

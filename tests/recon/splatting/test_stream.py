@@ -1,4 +1,4 @@
-"""StreamingFit: views that arrive one by one end in the same quality as all of them at once."""
+"""StreamingFit: projections one by one give the same quality as all at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A fit in a trial: it ends early where voxels lead, and knows no view held out."""
+"""A test fit: it ends early if voxel methods lead, and never uses held-out projections."""
 
 from __future__ import annotations
 

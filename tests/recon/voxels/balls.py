@@ -1,4 +1,4 @@
-"""Balls whose line integrals are known, and which may move during the scan: an oracle without voxels."""
+"""Balls with known line integrals, which may move during the scan: an independent check without voxels."""
 
 from __future__ import annotations
 

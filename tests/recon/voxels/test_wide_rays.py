@@ -1,4 +1,4 @@
-"""Rays with a width, of turning samples and of rows read one after the other, on voxels."""
+"""Rays with a width, on voxels: rotation during the exposure, and rows read one after another."""
 
 from __future__ import annotations
 

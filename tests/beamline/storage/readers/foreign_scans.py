@@ -1,4 +1,4 @@
-"""Foreign scans, an NXtomo and one of Data Exchange, with other values of their fields or more of them."""
+"""Scans of other programs (NXtomo, Data Exchange) with changed or additional field values."""
 
 from __future__ import annotations
 

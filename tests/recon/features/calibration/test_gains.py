@@ -1,4 +1,4 @@
-"""Gains learnt with the volume: rings go, and bodies on the axis stay, beside the filters of sinograms."""
+"""Pixel sensitivities measured with the volume: rings disappear, bodies on the axis stay; compared with filters."""
 
 from __future__ import annotations
 

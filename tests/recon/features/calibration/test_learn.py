@@ -1,4 +1,4 @@
-"""Geometry learnt from views of analytic bodies: places, axis, roll; what nobody knows; no harm where all is right."""
+"""Geometry calibrated from projections of analytic bodies: shifts, axis, roll; no change if all is right."""
 
 from __future__ import annotations
 

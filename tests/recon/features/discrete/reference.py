@@ -1,4 +1,4 @@
-"""Reference implementation of the posterior mean of few materials in float64: integrals over the true density."""
+"""Reference implementation of the posterior mean with discrete levels, in float64: integrals over the true density."""
 
 from __future__ import annotations
 

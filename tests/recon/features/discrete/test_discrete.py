@@ -1,4 +1,4 @@
-"""Discrete tomography: what it gains on grains of two materials, and where few materials are refused."""
+"""Discrete tomography: its gain on grains of two materials, and samples for which discrete levels are rejected."""
 
 from __future__ import annotations
 

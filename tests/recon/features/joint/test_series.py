@@ -1,4 +1,4 @@
-"""Volumes in time from one scan: known answers, against sub-scans and one volume of all views; what is refused."""
+"""Volumes in time from one scan: known answers, comparison with sub-scans and a single volume, and errors."""
 
 from __future__ import annotations
 

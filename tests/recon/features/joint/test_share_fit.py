@@ -1,4 +1,4 @@
-"""The share of one of two states, smooth within matter: transposes, a known answer, and against the fit without it."""
+"""The smooth share of one of two states: transposes, a known answer, and the fit without it."""
 
 from __future__ import annotations
 

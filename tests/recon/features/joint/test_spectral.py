@@ -1,4 +1,4 @@
-"""Materials from views of several energies: known answers, gradients, and against one volume an energy."""
+"""Materials from projections at several energies: known answers, gradients, and one volume per energy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stripes: known ones are taken out, what has none is left alone, and a crack stays a crack."""
+"""Stripes: known ones are removed, data without stripes are unchanged, and a crack stays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the Triton kernels are tested: on CUDA where there is one, else interpreted; geometries and comparisons."""
+"""Where the Triton kernels are tested: on CUDA if there is one, otherwise interpreted; geometries, comparisons."""
 
 from __future__ import annotations
 

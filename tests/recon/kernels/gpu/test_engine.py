@@ -1,4 +1,4 @@
-"""A fit is the same on both backends, calls go to the device of their tensors, and errors say what is missing."""
+"""A fit is the same on both backends, calls run on the device of their tensors, and errors name what is missing."""
 
 from __future__ import annotations
 

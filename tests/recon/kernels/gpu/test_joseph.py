@@ -1,4 +1,4 @@
-"""The voxel projector and its transpose: the Triton kernels against those of the CPU."""
+"""The voxel projector and its transpose: the Triton kernels compared with the CPU kernels."""
 
 from __future__ import annotations
 
