@@ -1,5 +1,4 @@
-"""Errors of the float32 kernels compared with the float64 reference, and the bounds of float32; see docs/numerics.md.
-"""
+"""Errors of the float32 kernels compared with the float64 reference, and the bounds of float32; see docs/numerics.md."""
 
 from __future__ import annotations
 
