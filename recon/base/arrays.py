@@ -35,7 +35,7 @@ def frozen(values: F64) -> F64:
 
 
 def median_deviation(values: NDArray[np.floating[Any]]) -> float:
-    """Standard deviation of the normal distribution with this median of absolute values; 0 if none is finite."""
+    """Standard deviation of the normal distribution with this median of absolute values; 0 if no value is finite."""
     finite = values[np.isfinite(values)]
     return float(np.median(np.abs(finite))) / MEDIAN if finite.size else 0.0
 
@@ -59,7 +59,7 @@ def bin_views(projections: NDArray[np.float32], factor: int) -> NDArray[np.float
     transmission. The correction can bin the counts instead (`--bin`).
 
     Raises:
-        ValueError: for a factor below 1, or larger than the detector.
+        ValueError: the factor is below 1 or larger than the detector.
     """
     n, rows, cols = projections.shape
     if not 1 <= factor <= min(rows, cols):

@@ -1,4 +1,4 @@
-"""Transcripts: command lines that end with an error, with their exit codes and messages.
+"""Transcripts: command lines and the errors with which they end, as text files.
 
 A transcript is a text file of blocks, with an empty line between two:
 
@@ -6,12 +6,12 @@ A transcript is a text file of blocks, with an empty line between two:
     $ recon scan.h5 --config recipe.yaml (--dry-run)
     2 Error: ...
 
-Lines with `<` are files that the block has besides those of its world. The command is called with and without what is
-in brackets. The last line is the exit code and the sentence, its white space joined. Whatever is refused, stdout stays
-empty and no file changes.
+Lines with `<` define additional files for the block. The command is called with and without the part in brackets. The
+last line is the exit code and the message, with white space joined. In all cases stdout must stay empty and no file may
+change.
 
-`python -m tests.beamline.transcript [FILE ...]` writes the last lines anew, of all transcripts without a name; read
-their differences.
+`python -m tests.beamline.transcript [FILE ...]` rewrites the last lines (without a name: of all transcripts). Read the
+differences.
 """
 
 from __future__ import annotations
