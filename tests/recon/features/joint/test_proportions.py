@@ -1,4 +1,4 @@
-"""Factors that are smooth within the sample: transpose, gradient, and known factors from several kinds of projections."""
+"""Smooth factors within the sample: transpose, gradient, and known factors from several kinds of projections."""
 
 from __future__ import annotations
 
