@@ -157,7 +157,7 @@ def remove_rings(
             f"{theta.shape}"
         )
     if not (np.isfinite(views).all() and np.isfinite(theta).all()):
-        raise ValueError("projections or angles hold NaN or infinite values; correct them first")
+        raise ValueError("projections or angles contain NaN or infinite values; correct them first")
     warn_of_other_quantity(views)
     return WithoutRings(views, *remove_rings_in_place(views, theta, rings, axis_col))
 

@@ -78,7 +78,7 @@ class Counts:
                     f"{name} has shape {given}; for counts of shape {shape} it must be {' or '.join(map(str, allowed))}"
                 )
         if not 0 < self.gain < np.inf:
-            raise ValueError(f"gain is the counts of one photon, finite and above 0, got {self.gain}")
+            raise ValueError(f"gain (counts per photon) must be finite and above 0, got {self.gain}")
         if not np.asarray(self.variance).min() >= 0:
             raise ValueError(f"variance must be 0 or more, got {np.asarray(self.variance).min()}")
         if not (np.asarray(self.flat) > np.asarray(self.dark)).any():
