@@ -196,7 +196,7 @@ def _spread(geometry: Geometry, axis: int) -> tuple[int, float]:
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Attenuation on a grid. `data` is float32 [z, y, x] in 1/mm (1/pixel where the pitch is 1)."""
+    """Attenuation on a grid. `data` is float32 [z, y, x] in 1/mm (1/pixel if the pitch is 1)."""
 
     data: NDArray[np.float32]
     grid: Grid

@@ -194,7 +194,7 @@ class StreamingFit:
         return measured, rendered if weight is None else np.where(weight == 0, measured, rendered)
 
     def replace_views(self, data: F32, kept: ArrayLike | None = None) -> None:
-        """Replace the line integrals [view, row, col] of all views so far, in order: their correction has changed.
+        """Replace the line integrals [view, row, col] of all projections so far, in order, after a changed correction.
 
         The model is kept, unless the new data differ by a fifth from the data with which the Gaussians were placed. In
         that case the Gaussians are placed again. `kept` are the numbers of the projections that these data belong to,
@@ -231,7 +231,7 @@ class StreamingFit:
         return changed > _OTHERS**2 * total
 
     def replace_newest(self, data: F32) -> None:
-        """Replace the line integrals [row, col] of the newest view: its correction has changed.
+        """Replace the line integrals [row, col] of the newest projection, after a changed correction.
 
         Raises:
             ValueError: as for `add_views`, or there is no projection; nothing is changed.
