@@ -17,7 +17,7 @@ SETTLE = 0.05
 
 
 class Run:
-    """A scan run to its end, whatever that is."""
+    """A scan that has run to its end, however it ended."""
 
     def __init__(
         self,

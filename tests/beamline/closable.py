@@ -2,7 +2,7 @@
 
 
 class Closable:
-    """It counts how often it was closed."""
+    """A device that counts how often it was closed."""
 
     name = "stage"
 

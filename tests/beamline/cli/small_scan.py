@@ -16,7 +16,7 @@ def beamline(*arguments: object) -> Result:
 
 
 def succeeds(*arguments: str) -> Result:
-    """A command that ends well."""
+    """Run a command that must succeed."""
     result = beamline(*arguments)
     assert result.exit_code == 0, result.output
     return result
