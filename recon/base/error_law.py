@@ -12,9 +12,10 @@ import math
 from dataclasses import dataclass
 
 BELOW = 0.5
-"""A gain is assumed to lie at most this share of the mean below the mean, and above it if an error model is known.
+"""For the low end of a gain's range, exponent and noise share are lowered by at most this share of themselves.
 
-The value is a convention."""
+For the high end they may be raised by more. The value is a convention.
+"""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,8 @@ class Gain:
     def at_most(self) -> float:
         """The gain to assume before further projections are given up.
 
-        It is the mean, or the high end if the exponent is uncertain by half or more."""
+        It is the mean, or the high end if the exponent is uncertain by half or more.
+        """
         return self.mean if self.high <= (1 + BELOW) * self.mean * (1 + 1e-9) else self.high
 
 
@@ -53,8 +55,13 @@ class ErrorLaw:
     offset: float = 0.0
 
     def gain(self, views: int = 0, again: int = 0, wide: bool = False) -> Gain:
-        """Improvement in PSNR (dB) from more projections: at new angles, at the same angles again, or offset
-        laterally."""
+        """Improvement in PSNR (dB) from more projections.
+
+        Args:
+            views: number of projections at new angles.
+            again: number of repeated projections at the same angles.
+            wide: also laterally offset projections.
+        """
 
         def decibels(factor: float) -> float:  # with the exponent and the shares multiplied by this factor
             noise = min(factor * self.noise, 1 - self.offset)

@@ -136,7 +136,7 @@ def _evenly_spread(geometry: Geometry) -> NDArray[np.intp] | None:
 def air_level(values: F32) -> tuple[float, float]:
     """The air level of a volume and its standard deviation.
 
-    It starts at the lowest value that many voxels have, and repeatedly takes the mean of the values within four
+    It starts at the lowest value that many voxels have, and repeatedly takes the median of the values within four
     standard deviations. If air is uneven, its standard deviation is limited to four times that of the values below the
     first level.
     """

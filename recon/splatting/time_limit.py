@@ -77,11 +77,12 @@ class FinishPlan(NamedTuple):
 
 
 def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid: Grid, now: Clock) -> FinishPlan:
-    """The voxel refinement within `seconds`: at most the usual iterations, or more if `beside_steps` s are enough.
+    """Plan the voxel refinement of a fit within `seconds`.
 
-    `beside_steps` must suffice for PnP-DCT and test reconstructions. If time is short, the weight is chosen without
-    test reconstructions, which on few rows take longer than seven refinements. If there is time for fewer than two
-    iterations, the result is 0, because the work before them takes as long.
+    If `seconds` and `beside_steps` (the time that the fitting steps leave) are enough, the plan is the default
+    refinement with PnP-DCT and test reconstructions. Otherwise it has at most the usual number of iterations. If time
+    is short, the weight is chosen without test reconstructions, which on few rows take longer than seven refinements.
+    If there is time for fewer than two iterations, the plan has none, because the work before them takes as long.
     """
     if seconds <= 0:
         return FinishPlan(0, 0.0)

@@ -25,7 +25,7 @@ _FIRST_SHARE, _LEAST_SHARE = 0.5, 1 / 16  # shares of the weight of total variat
 
 
 def in_field(problem: VoxelProblem) -> NDArray[np.bool_]:
-    """[y, x, z] voxels inside the field of view of a full rotation; outside, too few rays distinguish levels."""
+    """[y, x, z] voxels inside the field of view of a 360° scan; outside, too few rays distinguish the levels."""
     _, y, x = problem.projector.grid.coordinates()
     field = np.hypot(y[:, None], x) < problem.projector.geometry.reach
     return np.repeat(field[:, :, None], problem.projector.grid.shape[0], axis=2)
