@@ -198,8 +198,7 @@ class Geometry:
 
     @property
     def rows_show_slices(self) -> bool:
-        """Whether each detector row shows one slice in all projections: parallel, straight, not shifted along the
-        axis."""
+        """Whether each detector row shows one slice in all projections: parallel, straight, no shift along the axis."""
         return self.is_straight and not (self.is_cone or self.shifts[:, 1].any())
 
     @property
@@ -247,8 +246,7 @@ class Geometry:
 
     @property
     def is_centred(self) -> NDArray[np.bool_]:
-        """[view] True for ordinary projections, False for those offset laterally by more than half the detector
-        width."""
+        """[view] True for ordinary projections, False if offset laterally by more than half the detector width."""
         aside = self.shifts[:, 0]
         usual = np.sort(aside)[(aside.size - 1) // 2]
         return np.asarray(np.abs(aside - usual) <= self.detector_shape[1] / 2)

@@ -71,13 +71,11 @@ class Kernel(StrEnum):
 
     @property
     def affine_terms(self) -> tuple[float, float, float, float]:
-        """Factors of βᵀΣ₂β, αᵀΣ₂β, αᵀΣ₂α and η² in the error of an affine footprint, see
-        `recon.kernels.cpu.footprints`."""
+        """Factors of βᵀΣ₂β, αᵀΣ₂β, αᵀΣ₂α and η² in the error of an affine footprint, see `kernels.cpu.footprints`."""
         return (2 / 3, 4 / 3, 10 / 3, 256 / 21) if self.is_compact else (1 / 2, 1.0, 3 / 2, 6.0)
 
     def reach(self, sigmas: float) -> float:
-        """Cut-off radius in standard deviations: `sigmas` for a Gaussian, the end of the profile for a compact
-        kernel."""
+        """Cut-off radius in standard deviations: `sigmas` for a Gaussian, the end of a compact kernel."""
         return self.radius if self.is_compact else sigmas
 
 

@@ -405,7 +405,6 @@ class Method(Checked, ABC):
 
     @classmethod
     def ended_by(cls, seconds: float) -> dict[str, Plain]:
-        """Settings with which only a time limit of `seconds` ends a run; empty if the method has a length of its
-        own."""
+        """Settings with which only a time limit of `seconds` ends a run; empty if the method ends by itself."""
         lengths: dict[str, Plain] = {"seconds": seconds, "steps": _ENDLESS, "iterations": _ENDLESS}
         return {name: value for name, value in lengths.items() if name in types_of(cls)}

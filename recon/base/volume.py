@@ -126,8 +126,7 @@ class Grid:
         return replace(self, shape=(self.shape[0], y, x), centre=(self.centre[0], *middle.tolist()))
 
     def as_tall_as_rays(self, geometry: Geometry) -> Grid:
-        """The box with whole slices added until it contains all rays of a cone, which rise or fall towards its
-        corners."""
+        """The box with whole slices added until it contains all rays of a cone, which rise or fall to its corners."""
         corner, edge = float(np.hypot(*np.abs(self.edges[:, :2]).max(axis=0))), self.spacing[0]
         # how far a row's rays rise on this distance
         row = min(corner / geometry.source_distance, 1.0) * geometry.sample_pitch

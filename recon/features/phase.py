@@ -66,8 +66,7 @@ class Paganin:
         return math.ceil(_REACH * max(self.length, 0.0 if self.unsharp is None else self.unsharp[0]))
 
     def retrieve(self, views: F32, floor: float) -> None:
-        """Replace measured line integrals [view, row, col] by those of the sample, in place; `floor`: least
-        transmission."""
+        """Replace line integrals [view, row, col] by those of the sample, in place; `floor`: least transmission."""
         f2 = _squared_frequencies(views)
         gain = 1 / (1 + (2 * math.pi * self.length) ** 2 * f2)
         if self.unsharp is not None:

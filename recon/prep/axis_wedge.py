@@ -286,8 +286,7 @@ def _wedge_residuals(data: Floats, theta: Floats) -> tuple[Floats, Floats]:
     re, im = spectrum.real.copy(), spectrum.imag.copy()
 
     def residual_power(first: int) -> list[Floats]:
-        """[row, k] re·re, im·im and re·im after the fit of the harmonics first, first + 2 ... up to each frequency's
-        limit."""
+        """[row, k] re·re, im·im and re·im after the fit of harmonics first, first + 2 ... up to a frequency's limit."""
         order = np.repeat(np.arange(first, harmonics[-1] + 1, 2), 2)
         columns = np.where(np.arange(order.size) % 2, np.sin(np.outer(theta, order)), np.cos(np.outer(theta, order)))
         if first == 0:  # sin 0

@@ -173,8 +173,7 @@ class AirSums:
         )  # fmt: skip
 
     def _farthest(self, squares: F64, some: list[int]) -> float:
-        """The largest variance of a surface with these terms, divided by that of a constant, in a typical
-        projection."""
+        """Largest variance of a surface with these terms, divided by that of a constant, in a typical projection."""
         g = np.median(squares, axis=0)
         terms = self._terms.reshape(-1, self._terms.shape[-1])[:, some]
         return float(np.einsum("ri,ij,rj->r", terms, np.linalg.pinv(g, hermitian=True), terms).max() * g[0, 0])

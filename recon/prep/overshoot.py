@@ -68,8 +68,7 @@ class Overshoot:
 
     @classmethod
     def of_counts(cls, counts: F32, dark: F32 | float, flat: F32 | float) -> Overshoot:
-        """The same for counts [view, row, col], with dark and flat [row, col]; pixels without beam in the flat count as
-        air."""
+        """The same for counts [view, row, col], with dark and flat [row, col]; pixels without beam count as air."""
         beam = flat - dark
         transmission = np.where(beam > 0, (counts - dark) / np.where(beam > 0, beam, 1), 1)
         return cls.of(-np.log(np.maximum(transmission, 1e-6)).astype(np.float32))

@@ -45,8 +45,7 @@ class Projections:
 
     @property
     def lit(self) -> Mask | None:
-        """bool [view, row, col] True for pixels with data; None: all. Single lines are interpolated and count as
-        data."""
+        """bool [view, row, col] True for pixels with data; None: all (interpolated single lines count as data)."""
         lit = np.repeat(~areas(self.masked)[None], len(self.data), axis=0)
         index_of = {int(view): number for number, view in enumerate(self.view_ids)}
         for view, row, first, end in self.unmeasured[np.isin(self.unmeasured[:, 0], self.view_ids)].tolist():

@@ -102,8 +102,7 @@ def dark_at(exposure: float, darks: Sequence[tuple[float, Kept]]) -> Kept:
 
 
 def flat_at(position: float, groups: Sequence[tuple[float, Image]], part_starts: tuple[int, ...]) -> Image:
-    """Flat minus dark at a frame's position: interpolated between the groups of its part, otherwise the nearest
-    group."""
+    """Flat minus dark at a frame's position: interpolated between groups of its part, otherwise the nearest group."""
     part = bisect_right(part_starts, position)
     own = [group for group in groups if bisect_right(part_starts, group[0]) == part]
     groups = own or [min(groups, key=lambda group: abs(group[0] - position))]

@@ -198,8 +198,7 @@ class PredictionErrors:
 
 @dataclass(frozen=True, eq=False)
 class BetterVolume:
-    """The volume so far, in 1/mm, that predicts held-out projections best. `direct`: it is from FBP, not from the
-    fit."""
+    """The volume so far, in 1/mm, that predicts held-out projections best; `direct`: FBP made it, not the fit."""
 
     volume: Volume
     direct: bool

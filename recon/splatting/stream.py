@@ -285,8 +285,7 @@ class StreamingFit:
                 return self.progress()
 
     def _next_view(self, state: fit.FitState) -> int | None:
-        """The first projection of the next step; None: any in turn, except held-out ones, which wait for the final
-        fit."""
+        """The first projection of the next step; None: any in turn (held-out ones wait for the final fit)."""
         if len(state.drawn) < self._settings.views_per_step:
             state.drawn = [view for view in self._rng.permutation(self.n_views).tolist() if not self._held_out[view]]
         view = self._unseen.pop(0) if self._unseen else next_view(self.n_views, self._rng)

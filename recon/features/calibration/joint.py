@@ -117,7 +117,7 @@ def edge_motion(geometry: Geometry) -> float:
 
 
 def moved(geometry: Geometry, steps: dict[str, NDArray[np.float64]], farthest: float) -> Geometry:
-    """The geometry after steps along `slopes` of at most `farthest` pixels, without the part that data cannot
+    """The geometry after steps along `slopes` of at most `farthest` pixels, without parts that data cannot
     determine."""
     limited = {name: np.clip(step, -farthest, farthest) for name, step in steps.items()}
     shifts, axis = geometry.shifts.copy(), geometry.axis_col

@@ -259,8 +259,7 @@ class EnergyFit:
                 ahead(self.z)
 
     def residual_of(self, densities: F32) -> float:
-        """Norm of the residual of all projections for densities [material, z, y, x], divided by that of the
-        projections."""
+        """Norm of the residual for densities [material, z, y, x], divided by the norm of all projections."""
         self.z = np.ascontiguousarray(np.einsum("km,mzyx->kyxz", self._to.astype(np.float32), densities))
         out = np.empty_like(self.z)
         return math.sqrt(sum(self.descent(subset, out) for subset in self.subsets)) / self._norm
