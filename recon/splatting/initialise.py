@@ -40,7 +40,7 @@ measured.
 """
 
 # No Gaussian is placed in voxels below this fraction of the density unit (Zha et al. 2024: τ = 0.05).
-MATTER = 0.05
+LEAST_DENSITY = 0.05
 
 # The published start: density of a Gaussian divided by that of its voxel; its least width divided by that of the field.
 _PUBLISHED_SHARE, _PUBLISHED_LEAST = 0.15, 0.0005
@@ -174,7 +174,7 @@ def mean_change(
     data = first_volume(projections, geometry, slab, device=device).data if known is None else known.data[middle]
     lines = volume_lines(np.maximum(data, 0))
     unit = density_unit(lines)
-    in_sample = np.count_nonzero(lines > MATTER * unit)
+    in_sample = np.count_nonzero(lines > LEAST_DENSITY * unit)
     return float(total_variation(lines, difference_weights(slab)) / (in_sample * unit)) if in_sample else 0.0
 
 
@@ -207,7 +207,7 @@ def sample_gaussians(
     Raises:
         ValueError: the volume contains no material inside the field of view.
     """
-    data, unit, candidates = _matter(volume, field_radius, smooth)
+    data, unit, candidates = _material(volume, field_radius, smooth)
     data /= unit  # so that squared gradients stay in the range of float32
     value, slope = data.ravel()[candidates], np.empty(candidates.size, np.float32)
     slopes_at(_smoothed(data, _SLOPE_SIGMA), candidates, slope)
@@ -234,7 +234,7 @@ def sample_as_published(
     code, Gaussians are half a voxel away from the voxel centres; here they are at the centres. Arguments and errors as
     in `sample_gaussians`.
     """
-    data, unit, candidates = _matter(volume, field_radius, 0.0)
+    data, unit, candidates = _material(volume, field_radius, 0.0)
     chosen = rng.permutation(candidates)[:n]
     z, y, x = volume.grid.coordinates()
     k, j, i = np.unravel_index(chosen, data.shape)
@@ -245,16 +245,18 @@ def sample_as_published(
     return Gaussians.from_physical(means, scales, densities, density_unit=unit, kernel=kernel)
 
 
-def _matter(volume: Volume, field_radius: float, smooth: float) -> tuple[NDArray[np.float32], float, NDArray[np.int64]]:
+def _material(
+    volume: Volume, field_radius: float, smooth: float
+) -> tuple[NDArray[np.float32], float, NDArray[np.int64]]:
     """The smoothed volume within the field of view, its density unit, and the voxels in which a Gaussian may start."""
     data = _smoothed(np.maximum(volume.data, 0), smooth)
     _, y, x = volume.grid.coordinates()
     data *= (x[None, :] ** 2 + y[:, None] ** 2) <= field_radius**2
     unit = density_unit(data)
-    candidates = np.flatnonzero(data.ravel() > MATTER * unit) if unit > 0 else np.empty(0, np.int64)
+    candidates = np.flatnonzero(data.ravel() > LEAST_DENSITY * unit) if unit > 0 else np.empty(0, np.int64)
     if candidates.size < 4:
         raise ValueError(
-            f"the initial volume contains no material: only {candidates.size} voxels are above {MATTER:.0%} of "
+            f"the initial volume contains no material: only {candidates.size} voxels are above {LEAST_DENSITY:.0%} of "
             f"{unit:.3g} 1/mm. Are the projections line integrals (-log of the transmission), and is the rotation "
             "axis right?"
         )
