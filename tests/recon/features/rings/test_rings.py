@@ -99,7 +99,7 @@ def test_auto_removes_detected_stripes_and_reports_it(clean: F32, gains: F32) ->
         assert (stack == before).all() == (said == "no visible stripes")
         np.testing.assert_allclose(taken, (before - stack).mean(axis=0), atol=1e-6)
     few = clean[:7, None].copy()
-    assert "7 views of 240 columns are too few" in remove_rings_in_place(few, ANGLES[:7], "vo")[1]
+    assert "7 projections of 240 columns are too few" in remove_rings_in_place(few, ANGLES[:7], "vo")[1]
     np.testing.assert_array_equal(few, clean[:7, None])
     assert remove_rings_in_place(clean[:, None].copy(), ANGLES, "none")[1] == ""
 
