@@ -1,4 +1,4 @@
-"""Each command line in the pages names a command, options and arguments that there are."""
+"""Each command line in the pages uses existing commands, options and arguments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each code block of README, and of Python in any page, runs as it is printed, or is listed here with the reason."""
+"""Each code block of README, and each Python block of a page, runs as printed, or is listed here with a reason."""
 
 from __future__ import annotations
 

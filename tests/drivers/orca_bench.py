@@ -1,4 +1,4 @@
-"""An ORCA-Quest, real or simulated, on the bench of the suite that is shipped."""
+"""An ORCA-Quest, real or simulated, for the conformance suite that is shipped."""
 
 from __future__ import annotations
 

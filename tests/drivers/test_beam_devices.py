@@ -1,4 +1,4 @@
-"""The laws of every filter and monochromator: by hand, on a motor, simulated, and behind variables of a soft IOC."""
+"""Common tests of filters and monochromators: by hand, by motor, simulated, and behind a soft IOC."""
 
 from __future__ import annotations
 

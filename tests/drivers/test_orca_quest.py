@@ -1,4 +1,4 @@
-"""ORCA-Quest figures against the numbers that the vendor prints."""
+"""ORCA-Quest figures compared with the vendor's published numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sample mover by a motor goes to its two places, asks where it is, and says what stopped it."""
+"""A motor that moves the sample reaches its two positions, finds out where it is, and reports what stopped it."""
 
 from __future__ import annotations
 

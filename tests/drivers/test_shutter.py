@@ -1,4 +1,4 @@
-"""A shutter on an output: what goes out, how long it waits, and what it believes when the output disobeys."""
+"""A shutter on an output: signals, waiting times, and its state if the output does not respond."""
 
 from __future__ import annotations
 

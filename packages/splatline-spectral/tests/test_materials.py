@@ -128,7 +128,7 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
     wrong.write_text("kev,fresh\n8.3,1\n")
     for words, said in (
         ([*scans, "--spectra", narrow], "expected 8.34 to 8.36 keV"),
-        ([scans[0], "--spectra", spectra(tmp_path)], "cannot distinguish 2 materials"),
+        ([scans[0], "--spectra", spectra(tmp_path)], "cannot separate 2 materials"),
         ([*scans, "--spectra", wrong], "begins with 'kev,fresh'"),
         ([*scans, "--spectra", tmp_path / "absent.csv"], "cannot be read as a table of spectra"),
     ):

@@ -1,4 +1,4 @@
-"""The camera alone in plans of bluesky: frames in a file of ours, documents that are valid, lost frames named."""
+"""The camera alone in bluesky plans: it writes our file format, emits valid documents, and names lost frames."""
 
 import math
 from collections.abc import Generator

@@ -1,4 +1,4 @@
-"""Documents by 0MQ reach bluesky's own dispatcher, and a proxy that is gone or hangs holds nobody up."""
+"""Documents over 0MQ reach bluesky's own dispatcher; a proxy that is gone or hangs delays nobody."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""`beamline check`: the verdict, the figures, and exit code 2 with nothing moved or written."""
+"""`beamline check`: its verdict, its figures, and exit code 2; nothing moves and nothing is written."""
 
 import json
 from pathlib import Path

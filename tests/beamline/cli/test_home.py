@@ -1,4 +1,4 @@
-"""`beamline home`: asks before the stage turns, says where it stands, and stops it when it is cut off."""
+"""`beamline home`: asks before the stage turns, reports the position, and stops the stage if it is interrupted."""
 
 import pytest
 from click.testing import CliRunner, Result

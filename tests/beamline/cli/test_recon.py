@@ -1,4 +1,4 @@
-"""`beamline recon`: options, what is printed and what is left."""
+"""`beamline recon`: options, output on the terminal, and files."""
 
 import json
 import re
@@ -138,8 +138,8 @@ def test_rings_are_removed_recorded_and_told(folder: Path, shared_data: Path) ->
         record = read_reconstruction(folder / f"{rings}.h5")
         scores[rings] = ring_score(record.volume.data[0], (middle, middle))
         assert record.parameters["rings"] == rings
-        assert ("--rings auto (by a filter)" in result.stderr) == (rings == "none")
-    assert "Rings: removed by sort; stripes of" in result.stderr
+        assert ("--rings auto (a filter on the projections)" in result.stderr) == (rings == "none")
+    assert "Rings: removed by sort. The height of the stripes fell from" in result.stderr
     assert str(record.parameters["rings_removed"]) in result.stderr
     assert scores["auto"] < 0.5 * scores["none"], scores
 

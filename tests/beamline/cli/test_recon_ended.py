@@ -1,4 +1,4 @@
-"""`beamline recon` ended from outside: it delivers what it has, or leaves nothing; a checkpoint goes on."""
+"""`beamline recon` ended from outside: it delivers what it has, or leaves no file; a checkpoint can be resumed."""
 
 import signal
 import sys

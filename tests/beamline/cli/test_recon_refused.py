@@ -1,4 +1,4 @@
-"""`beamline recon` refuses for the disk, as a process, and what it made itself; refusals.txt has the others."""
+"""`beamline recon` stops with an error because of the disk or of its own files; refusals.txt has the other cases."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""`beamline scan`: what it prints where, what the signals do, and every exit code."""
+"""`beamline scan`: its output, its reaction to signals, and all exit codes."""
 
 import json
 import signal

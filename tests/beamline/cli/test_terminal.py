@@ -1,4 +1,4 @@
-"""A bar where a terminal is, few plain lines where there is none, and every event as words or nothing."""
+"""A progress bar on a terminal, few plain lines elsewhere; every event is either put into words or not shown."""
 
 import io
 from collections.abc import Iterator

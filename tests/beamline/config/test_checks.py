@@ -1,4 +1,4 @@
-"""What no single value's type can say is refused with its line: files, regions, outputs, triggers, controllers."""
+"""Errors that concern several values name their line: files, regions, outputs, triggers, controllers."""
 
 from pathlib import Path
 

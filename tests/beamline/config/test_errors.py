@@ -1,4 +1,4 @@
-"""Faults of a configuration say file, line, key, what was found and what is legal."""
+"""Errors in a configuration name the file, line, key, the value found and the legal values."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Configuration: precedence, defaults, round trip, its plan, and its scenes."""
+"""Configuration: precedence, defaults, round trip, the plan made from it, and its scenes."""
 
 import json
 import math

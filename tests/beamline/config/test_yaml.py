@@ -1,4 +1,4 @@
-"""YAML: what would take long is refused at once, and a fault is said in words, with the line that has to be mended."""
+"""YAML: files that would take long to parse are rejected at once; errors are in words, with the line to fix."""
 
 import time
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Other modules by the names of our packages are reported in one line, before anything else is imported."""
+"""Foreign modules with the names of our packages are reported in one line before anything else is imported."""
 
 import os
 import subprocess

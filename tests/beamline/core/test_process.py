@@ -1,4 +1,4 @@
-"""A child process: its lines arrive in order, and it has ended when it should have, however it takes that."""
+"""A child process: its lines arrive in order, and it has ended when it should have, whatever happens to it."""
 
 import os
 import subprocess

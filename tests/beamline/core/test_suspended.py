@@ -1,4 +1,4 @@
-"""Ctrl-Z suspends no scan: the stage would go on turning in front of an open shutter."""
+"""Ctrl-Z does not suspend a scan, because the stage would continue to turn with an open shutter."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""Composition root: a configuration becomes devices whose figures are those predicted; what cannot be is refused."""
+"""Connecting: a configuration becomes devices whose figures match the prediction; impossible ones raise an error."""
 
 import dataclasses
 import itertools

@@ -1,4 +1,4 @@
-"""Ask: a request is put to stderr and waits for Enter; where nobody sits, it says so."""
+"""Ask: a request appears on stderr and waits for Enter; if nobody is at the terminal, it says so."""
 
 import io
 import sys

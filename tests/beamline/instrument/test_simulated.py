@@ -1,4 +1,4 @@
-"""Simulated devices scan as real ones do: from the trigger to the right angle, with beam, on the clock asked for."""
+"""Simulated devices scan like real ones: trigger, right angle, beam, and the requested clock."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What a simulator knows of its scene reaches the run: labels beside the file, a cone in it, or a refusal."""
+"""Values of a simulated scene reach the run: labels next to the file, a cone geometry in it, or an error."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The light is compared with the flats where there is air, and with the views before; a drift is said once."""
+"""Intensity in air is compared with the flats and with earlier projections; a drift is reported once."""
 
 from collections.abc import Iterable
 from typing import Any

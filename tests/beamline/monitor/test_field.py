@@ -1,4 +1,4 @@
-"""The field: places and pixels without light, a sample that goes on beyond it, and what enters or leaves it."""
+"""Field of view: pixels without beam, a sample wider than the field, and what enters or leaves it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

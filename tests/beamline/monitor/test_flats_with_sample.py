@@ -1,4 +1,4 @@
-"""One group of flats with the sample in the beam is told by the views: at no view's angle, beside its place, round.
+"""One group of flats with the sample in the beam is detected from the projections, whatever the sample.
 
 Scans of balls by the formula of a sphere's chord, with photon noise, a beam with a profile, and stripes that drift.
 """

@@ -1,4 +1,4 @@
-"""Checks of frames by themselves: saturated pixels, repeated images, triggers, darks that are not dark, no light."""
+"""Checks of single frames: saturated pixels, repeated images, triggers, darks that are not dark, no beam."""
 
 from dataclasses import replace
 from typing import Any

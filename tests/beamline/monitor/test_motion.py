@@ -1,4 +1,4 @@
-"""A jump is flagged in the view in which it happens, a shake by its size across and down; nothing else is either."""
+"""A jump is flagged in its projection, a shake with its horizontal and vertical size; nothing else is flagged."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Views from the other side, and views taken again, tell the axis, shifts and changes of the sample."""
+"""Opposite and repeated projections reveal the axis, shifts and changes of the sample."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""Groups of darks and flats with one fault each: the fault is found with its figure, and good groups have none."""
+"""Groups of darks and flats with one fault each: the fault is found with its value; good groups have none."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""What checks could not look at is said, with the number of views; a whole scan of even steps has nothing of it."""
+"""Projections that checks could not examine are reported with their number; a complete scan has none."""
 
 from collections.abc import Iterable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Values of a run: what its log says, event by event."""
+"""Values of a run are derived from its log, event by event."""
 
 from dataclasses import replace
 from pathlib import Path

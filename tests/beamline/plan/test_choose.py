@@ -1,4 +1,4 @@
-"""What is measured next: the best gain a second until the target is met, and never beyond a target."""
+"""Choice of the next measurement: the best gain per second until the target is met, and no further."""
 
 import math
 from dataclasses import replace

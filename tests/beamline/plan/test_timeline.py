@@ -1,4 +1,4 @@
-"""Timeline: rows, pulses, times and limits against hand-worked figures and brute force."""
+"""Timeline: rows, pulses, times and limits compared with values worked out by hand and by brute force."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""A scan whose angles, heights or axis are wrong is told of, with what its views show; a right one is not."""
+"""A scan with wrong angles, heights or axis is reported with what its projections show; a right one is not."""
 
 from __future__ import annotations
 

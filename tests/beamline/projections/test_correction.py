@@ -1,4 +1,4 @@
-"""The correction of a scan reads what is asked for and the references, and gives the same in batches as at once."""
+"""The correction reads only the requested frames, flats and darks, with the same result in batches and at once."""
 
 from __future__ import annotations
 

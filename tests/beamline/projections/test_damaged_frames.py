@@ -1,4 +1,4 @@
-"""Frames whose pixels are not those that were written are named, and used only where that is asked for."""
+"""Frames whose pixels differ from what was written are named, and used only if the user asks for it."""
 
 from __future__ import annotations
 

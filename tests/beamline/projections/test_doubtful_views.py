@@ -1,4 +1,4 @@
-"""What a scan reads well and yet is doubtful: an axis that its views contradict, and views that are copies."""
+"""Doubtful scans that can be read: the projections contradict the stated axis, or some are copies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a file's frames to line integrals: the right numbers, the right geometry, only what was asked for."""
+"""From frames to line integrals: right values, right geometry, and nothing that was not requested."""
 
 from __future__ import annotations
 

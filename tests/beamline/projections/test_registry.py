@@ -1,4 +1,4 @@
-"""Steps: their order, their options by their defaults, and what the file records of one that says nothing itself."""
+"""Correction steps: their order, their options by default, and the record of steps that state nothing."""
 
 from __future__ import annotations
 

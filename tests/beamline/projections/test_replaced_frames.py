@@ -1,4 +1,4 @@
-"""Darks and flats that are none are left out and named, or the scan is refused; none spoils a volume in silence."""
+"""Wrong darks and flats are left out and named, or the scan ends with an error; none spoils a volume silently."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A selection: columns there and back through bins, and words, rows, bins and axes that do not fit a scan."""
+"""Selections: columns through binning and back; words, rows, bins and axes that do not fit a scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames that others divided by their flats: transmission by its name, by flats of 1, and never as line integrals."""
+"""Frames that were already divided by flats: recognised as transmission, never used as line integrals."""
 
 from __future__ import annotations
 

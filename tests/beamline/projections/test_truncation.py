@@ -1,4 +1,4 @@
-"""A sample wider than the field is named; edges of matter are no air, and those of a beam that drifts are."""
+"""A sample wider than the field is reported; its edges are not used as air, those of a drifting beam are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views without light are no data: they are left out and named, at once, in batches and while a scan grows."""
+"""Projections without beam are left out and named: at once, in batches and during a scan."""
 
 from __future__ import annotations
 

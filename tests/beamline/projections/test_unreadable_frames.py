@@ -1,4 +1,4 @@
-"""A frame that a file does not give is left out and named, in views and references, whatever the format."""
+"""A frame that cannot be read is left out and named, for projections, flats and darks, in any format."""
 
 from __future__ import annotations
 

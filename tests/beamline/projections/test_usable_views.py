@@ -1,4 +1,4 @@
-"""Views with an alarm are left out, those with a warning weigh half, and --flags ignore weighs all equally."""
+"""Projections with an alarm are left out, with a warning count half; with --flags ignore all count equally."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a checkpoint is of this fit: every change of data or settings is found, and told by its name."""
+"""Whether a checkpoint belongs to this fit: every change of data or settings is found and named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Line integrals of a followed scan: flags, references that come late, and parts of a run, as of a finished one."""
+"""Line integrals during a scan equal those of the finished scan: flags, late flats and darks, parts of a run."""
 
 from __future__ import annotations
 

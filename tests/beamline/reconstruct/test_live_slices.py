@@ -1,4 +1,4 @@
-"""When slices of a growing scan are drawn, and what their heading says."""
+"""When slices are drawn during a scan, and what their heading says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Offline reconstruction: the right volume, everything it was made with, and nothing at all where it fails."""
+"""Offline reconstruction: the right volume with a complete record; if it fails, no file is left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A region of the volume: the voxels, and their places, of the whole volume."""
+"""A region of the volume: its voxels and their positions are those of the whole volume."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What speaks against a volume is said with frames and pixels of the file."""
+"""Remarks that speak against a volume name frames and pixels of the file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The seconds of a call: what its fit gets of them, what is said where they are too few, and what is then left out."""
+"""Time limit of a call: how much the fit gets, what is said if that is too little, and what is then left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Slabs that are stopped and resumed: the same volume to the bit, and nothing lost of what was finished."""
+"""Slabs that are stopped and resumed: the same volume bit for bit, and no finished work is lost."""
 
 from __future__ import annotations
 

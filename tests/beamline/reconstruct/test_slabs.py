@@ -1,4 +1,4 @@
-"""Slabs within a memory: the same volume, within the memory, with nothing left beside it."""
+"""Slabs within a memory limit: the same volume, within the limit, and no other files are left."""
 
 from __future__ import annotations
 

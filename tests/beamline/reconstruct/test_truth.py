@@ -1,4 +1,4 @@
-"""Truths: what is read, what fits, and volume files measured by them."""
+"""Ground truth: reading it, matching it to a volume, and measuring volume files with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scan that is stopped, aborted or cut short by a device: what was exposed keeps its angles, and it ends up safe."""
+"""A scan that is stopped, aborted or ended by a device: exposed frames keep their angles; the end is safe."""
 
 import numpy as np
 import pytest

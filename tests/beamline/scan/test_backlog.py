@@ -1,4 +1,4 @@
-"""A scan waits for room in memory and on its disk, and goes on when there is some."""
+"""A scan waits for free memory and disk space, and continues when there is some."""
 
 import re
 import time

@@ -1,4 +1,4 @@
-"""Filter and monochromator are where the scan wants them before its first frame, and the file says so."""
+"""Filter and monochromator are set as the scan wants before its first frame, and the file records it."""
 
 import math
 from collections.abc import Callable

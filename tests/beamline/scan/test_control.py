@@ -1,4 +1,4 @@
-"""Verbs from another terminal reach a running scan, and nobody waits for one that is dead."""
+"""Commands from another terminal reach a running scan, and nobody waits for a dead one."""
 
 import os
 import stat

@@ -1,4 +1,4 @@
-"""Scans that decide: a live reconstruction's laws, or the operator, choose what is measured; the file keeps why."""
+"""Scans that decide: an error model or the operator chooses what to measure; the file records the reason."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""The decider asks the law, or the operator, after each pass; where neither answers the plan goes on."""
+"""The decider asks the error model or the operator after each pass; without an answer, the plan continues."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""A series of energies: a scan of each in one folder, which goes on after a stop."""
+"""A series of energies: one scan for each in one folder, which can continue after a stop."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""The policy of a check: what its alarms do to a scan, and after how many frames."""
+"""Policy of a check: what its alarms do to a scan, and after how many frames."""
 
 from collections.abc import Mapping
 from pathlib import Path

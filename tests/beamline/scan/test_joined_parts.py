@@ -1,4 +1,4 @@
-"""A joined file is whole, also in a copy of its run; where its parts have changed or are missing it is refused."""
+"""A joined file is complete, also in a copied run; if its parts have changed or are missing, there is an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kill -9 of a scan while its live reconstruction works: the reconstruction ends, and the run has one whole volume."""
+"""kill -9 of a scan during its live reconstruction: the reconstruction ends, and the run has one complete volume."""
 
 import json
 import os

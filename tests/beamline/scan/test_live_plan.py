@@ -1,4 +1,4 @@
-"""The live volume that fits beside a scan, and what is said of it."""
+"""The live volume that is possible during a scan, and the messages about it."""
 
 import pytest
 

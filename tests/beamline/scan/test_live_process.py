@@ -1,4 +1,4 @@
-"""The live reconstruction beside a scan: its story is told among ours; neither its life nor its death costs a frame."""
+"""The live reconstruction of a scan: its events appear with ours; whatever happens to it, no frame is lost."""
 
 import json
 import sys

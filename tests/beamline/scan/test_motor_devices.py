@@ -1,4 +1,4 @@
-"""Scans with a sample that a motor moves, and with a stage behind a motor record, on the simulated instrument."""
+"""Simulated scans with a sample moved by a motor, and with a stage behind an EPICS motor record."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A step scan whose stage is moved after it has arrived, by whatever: no view has an angle that it was not taken at."""
+"""A step scan whose stage is moved after arrival, by anything: no projection has a wrong angle."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Offset views: the sample is stepped across the beam after the views, so that frames side by side show all of it."""
+"""Laterally offset projections: after the ordinary ones, the sample is moved across the beam to show all of it."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""A scan in passes: what is chosen after each is taken, nothing else, and the file says it."""
+"""A scan in passes: exactly what is chosen after each pass is measured, and the file records it."""
 
 import os
 import signal

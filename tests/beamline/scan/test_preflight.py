@@ -1,4 +1,4 @@
-"""Dry run: the figures of the shipped scans, what it refuses, and what it does not load or touch."""
+"""Dry run: the figures of the shipped scans, its errors, and that it loads and touches nothing else."""
 
 import shutil
 import subprocess

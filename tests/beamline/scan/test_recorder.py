@@ -1,4 +1,4 @@
-"""The recorder writes every frame in order, or says why it cannot, and never lets the camera wait for a dead disk."""
+"""The recorder writes every frame in order or says why it cannot; the camera never waits for a dead disk."""
 
 import re
 import threading

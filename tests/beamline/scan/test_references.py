@@ -1,4 +1,4 @@
-"""Bad darks and flats stop a scan before its first projection: a named end, a safe instrument, a readable file."""
+"""Bad darks and flats stop a scan before its first projection, with a reason, a safe instrument and a readable file."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Views with an alarm are taken again after the last one: bounded, once, at their angles, and used in their place."""
+"""Projections with an alarm are repeated after the last one: limited in number, once, at their angles."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,4 +1,4 @@
-"""A run leaves one folder with a readable file and the whole story, however it ends, and says what it must in time."""
+"""A run leaves one folder with a readable file and complete logs, however it ends, and reports in time."""
 
 import errno
 import io

@@ -1,4 +1,4 @@
-"""Runs of a folder: what they say of themselves, whatever became of them; newest first; quickly."""
+"""The runs in a folder: their description, whatever happened to them; newest first; quickly."""
 
 import errno
 import os

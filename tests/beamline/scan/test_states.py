@@ -1,4 +1,4 @@
-"""The table of states is closed, and the page has it."""
+"""The table of states is complete, and docs/states.md shows it."""
 
 import re
 from pathlib import Path

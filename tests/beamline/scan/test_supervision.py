@@ -1,4 +1,4 @@
-"""Too little beam pauses a scan until it is back, and what it spoilt is taken again."""
+"""Too little beam pauses a scan until it is back, and spoilt projections are repeated."""
 
 import math
 import threading

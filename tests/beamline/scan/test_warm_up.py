@@ -1,4 +1,4 @@
-"""The scintillator has light for the warm-up before each frame with light, whenever the shutter has been closed."""
+"""The scintillator is exposed for the warm-up time before each frame with beam, if the shutter was closed."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""A scan whose process is killed or frozen leaves a stage that stands and a closed shutter."""
+"""If the process of a scan is killed or freezes, the stage stops and the shutter closes."""
 
 import io
 import os

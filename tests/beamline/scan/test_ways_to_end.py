@@ -1,4 +1,4 @@
-"""However a scan ends: with all its frames, or with an exit code that is not 0. A check or an output ends none."""
+"""A scan ends with all frames or with an exit code other than 0; no check or output ends a scan."""
 
 import tempfile
 import threading

@@ -1,4 +1,4 @@
-"""Every copy of a scan states how the scan ended, as the scan itself does; or it is refused."""
+"""Every copy of a scan states how the scan ended, as the scan itself does; otherwise there is an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""docs/file_layout.md names what is written, and nothing else."""
+"""docs/file_layout.md names exactly what is written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run that ended early: every command says the same of it, and takes the folder of a run as its scan or volume."""
+"""A run that ended early: all commands describe it in the same way, and accept its folder as scan or volume."""
 
 from __future__ import annotations
 

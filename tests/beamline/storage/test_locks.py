@@ -1,4 +1,4 @@
-"""File systems without locks, and files that another program holds: the cause and a way out, and nothing half made."""
+"""File systems without locks, and files open in another program: cause and remedy, no partial file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scan that is open twice in a program is read as it was written, while it grows and afterwards: HDF5 shares it."""
+"""A scan opened twice in one program is read as written, while it grows and afterwards (HDF5 shares it)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Packed numbers are read as the values that CF and CIL say, in any dataset of a scan, or refused by name."""
+"""Packed numbers are read as the values that CF and CIL define, in any dataset, or end with an error by name."""
 
 from __future__ import annotations
 

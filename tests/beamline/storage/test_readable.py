@@ -1,4 +1,4 @@
-"""What a library says of a file's content makes a damaged file; a mistake of a reader is a defect."""
+"""An error of a library about file content means a damaged file; an error of our reader is a defect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a row of the frame log says of its frame has a checksum: a row that says something else is used by nobody."""
+"""Rows of the frame log have a checksum; a row that was changed is not used."""
 
 from __future__ import annotations
 

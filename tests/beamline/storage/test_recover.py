@@ -1,4 +1,4 @@
-"""A file whose writer died becomes an ordinary one: every committed frame, nothing that was not, in any program."""
+"""The file of a killed writer becomes an ordinary one with exactly the committed frames, for any program."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A file that draws on a pipe, is nested without end or claims more than a scan has is refused before it is read."""
+"""A file that reads from a pipe, is nested without end or claims impossible sizes ends with an error before reading."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Volume files: what is written by other hands is read as it is, and what is no volume is refused by name."""
+"""Volume files: files of other programs are read; files that are not volumes end with an error by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Causes: what loaders, operating systems and servers say, in a sentence and the way on."""
+"""Causes: messages of loaders, operating systems and servers as a sentence with a remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Beam monitors: a number out of text, over a local web server that misbehaves and an electrometer's wire."""
+"""Beam monitors: a number read from text, from a misbehaving local web server and from an electrometer."""
 
 from __future__ import annotations
 

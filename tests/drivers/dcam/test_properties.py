@@ -1,4 +1,4 @@
-"""Settings: applied, read back, refused without a trace; timing as the camera says."""
+"""Settings: applied, read back, or rejected without a change; timing as the camera reports it."""
 
 from __future__ import annotations
 

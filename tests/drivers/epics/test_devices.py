@@ -1,4 +1,4 @@
-"""Shutter and beam monitor behind process variables of a soft IOC: obedience, and each way to fail."""
+"""Shutter and beam monitor behind process variables of a soft IOC: commands work, and all ways to fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fault table: what breaks, how a scan must end, and for each controller why a fault is not its own.
+"""The fault table: what breaks, how a scan must end, and which faults a controller cannot have.
 
 docs/faults.md has a row for each of these, with the same names; `test_page` keeps them the same.
 """

@@ -1,4 +1,4 @@
-"""Faults of the camera: at each call of its library, and what frames, triggers and links can do."""
+"""Camera faults: at each library call, and of frames, triggers and links."""
 
 from __future__ import annotations
 

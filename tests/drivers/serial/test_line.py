@@ -1,4 +1,4 @@
-"""Serial line: framing, timeouts and finding the step again, on a wire that misbehaves."""
+"""Serial line: framing, timeouts and resynchronisation on a disturbed wire."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every stage: figures that no stage has, other makers' controllers, a second program."""
+"""Every stage: impossible values, controllers of other makers, a second program."""
 
 from __future__ import annotations
 

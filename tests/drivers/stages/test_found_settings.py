@@ -1,4 +1,4 @@
-"""Settings that a stage's driver changes: restored at the end, also those that a killed program left behind."""
+"""Settings that a stage driver changes are restored at the end, also those that a killed program left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Controllers without an answer to settings: a command that is lost, or arrives otherwise, is noticed at once."""
+"""Controllers that do not answer to settings: a lost or changed command is noticed at once."""
 
 from __future__ import annotations
 

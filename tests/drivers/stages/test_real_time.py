@@ -1,4 +1,4 @@
-"""Every stage on real time, by pseudo-terminal and TCP: a search, a train, the plug."""
+"""Every stage in real time, over pseudo-terminal and TCP: homing, a trigger train, a pulled plug."""
 
 from __future__ import annotations
 

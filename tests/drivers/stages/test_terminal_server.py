@@ -1,4 +1,4 @@
-"""Stages behind a terminal server that does otherwise than pass bytes on: who speaks, or is silent, is named."""
+"""Stages behind a terminal server that does not just pass bytes: the message names who answers or is silent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Batches: each scan gets its volume, a failure is named, and a second call does only what is left."""
+"""Batches: each scan gets its volume, a failure is named, and a second call does only what is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A client of EPICS sees a run go on, and a next one, and ends it where it may."""
+"""An EPICS client follows a run and the next one, and can end a run if this is allowed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`beamline export`: formats, grey values, what is refused and what is left."""
+"""`beamline export`: formats, grey values, errors, and files."""
 
 from __future__ import annotations
 

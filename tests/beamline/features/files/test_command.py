@@ -1,4 +1,4 @@
-"""`beamline info`, `validate` and `ingest`: what they print, their codes, and what they leave."""
+"""`beamline info`, `validate` and `ingest`: output, exit codes and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scan of any format on the page: what its stack, means and slices by FBP hold."""
+"""A scan of any format on the page: content of its stack, means and FBP slices."""
 
 import math
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Volumes in the browser: what slices, histograms and profiles hold."""
+"""Volumes in the browser: content of slices, histograms and profiles."""
 
 import json
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""A queue of scans: what is read of a table, which scans begin, and what is told at the end."""
+"""A queue of scans: what is read from a table, which scans start, and the summary at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`beamline simulate`: files, labels, truth, costs."""
+"""`beamline simulate`: files, labels, ground truth, and the resources it needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A step of the light is flagged in its view, with its size; spots of single frames are counted. Nothing else is."""
+"""An intensity step is flagged in its projection with its size; zingers are counted; nothing else is reported."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""What crosses the field faster than the sample turns is a floater; what turns with the sample never is."""
+"""Floaters: an object that crosses the field faster than the sample rotates is found; the sample itself never is."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Background of the beam: taken off where views confirm it, and nothing of the sample with it."""
+"""Beam background: subtracted if projections confirm it; nothing of the sample is removed."""
 
 from __future__ import annotations
 

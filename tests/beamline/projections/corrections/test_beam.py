@@ -1,4 +1,4 @@
-"""The beam of an option: a tube behind filters, or a table."""
+"""The option for the beam spectrum: a tube with filters, or a table."""
 
 from __future__ import annotations
 

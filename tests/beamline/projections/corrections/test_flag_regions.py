@@ -1,4 +1,4 @@
-"""Rays in the region of a flag weigh less, and the rest of the view is used as it is."""
+"""Rays in the region of a flag get less weight; the rest of the projection is used unchanged."""
 
 from __future__ import annotations
 

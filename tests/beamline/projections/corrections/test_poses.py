@@ -1,4 +1,4 @@
-"""Poses of views from a file become geometry: read, assigned to the views of a scan, and kept with the volume."""
+"""Poses from a file become geometry: they are read, assigned to projections, and stored with the volume."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_vectors_that_do_not_fit_the_scan_are_refused(path: Path, tmp_path: Path
         prepared(path, file, cone=(10.0, 15.0))
     cone[5, 6:9] *= 1.1
     file = table(tmp_path, columns, np.arange(N), *cone.T)
-    with pytest.raises(DataError, match=r"view 5: its detector pixels .* Nothing was read"):
+    with pytest.raises(DataError, match=r"projection 5: the detector pixels .* Nothing was read"):
         prepared(path, file, axis_col=None, cone=(10.0, 15.0))
     with pytest.raises(ValueError, match=r"expected a header .*src_x, src_y"):
         read_poses(str(table(tmp_path, columns.replace(",u_z", ""), np.arange(N), *np.delete(cone, 8, axis=1).T)))

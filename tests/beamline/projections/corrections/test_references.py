@@ -1,4 +1,4 @@
-"""A scan whose end flats or darks are bad is reconstructed by the good ones; one without good ones is refused."""
+"""If flats or darks at the end are bad, the good ones are used; a scan without good ones ends with an error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views of a tilted stage: as good a volume as of a straight one, slab by slab, and a warning where nobody asked."""
+"""Tilt: the volume is as good as without tilt, in slabs too; a warning appears if no correction was asked for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The width of rays: asked for, or the motion that the file of a fly scan states."""
+"""The ray width: from an option, or from the motion that the file of a fly scan states."""
 
 from __future__ import annotations
 

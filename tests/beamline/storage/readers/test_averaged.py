@@ -1,4 +1,4 @@
-"""Several frames a view: means of those that are good, and which frames belong together."""
+"""Several frames per projection: the mean of the good ones, and which frames belong together."""
 
 from __future__ import annotations
 

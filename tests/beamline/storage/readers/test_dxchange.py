@@ -1,4 +1,4 @@
-"""Data Exchange: three separate stacks seen as one scan; nothing about it is guessed."""
+"""Data Exchange: three separate stacks read as one scan, without guessing."""
 
 from __future__ import annotations
 

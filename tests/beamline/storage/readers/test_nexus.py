@@ -1,4 +1,4 @@
-"""What a NeXus file states of cone, pixels, mirrored frames and other scans is used or named."""
+"""Cone geometry, pixel size, mirrored frames and other scans in a NeXus file are used or named."""
 
 from __future__ import annotations
 

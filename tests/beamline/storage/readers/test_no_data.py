@@ -1,4 +1,4 @@
-"""Gaps between modules and photon counters: marks are no counts, and a dark of 0 is taken where the noise shows it."""
+"""Module gaps and photon counters: marker values are not counts; a dark of 0 is used if the noise shows it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading NXtomo: replay gives back the frames; foreign files are read by their structure, and never guessed at."""
+"""Reading NXtomo: replay gives the same frames; files of other programs are read by structure, without guessing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One scan, whatever the order of its dimensions, of which some may have length one, and whatever keeps it."""
+"""The same scan with its dimensions in any order, some of length one, in any container."""
 
 from __future__ import annotations
 

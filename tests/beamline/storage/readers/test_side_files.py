@@ -1,4 +1,4 @@
-"""Files of scanners' makers beside images: offered where they fit, taken where they are named, never guessed."""
+"""Files of scanner makers next to images: offered if they fit, used if named, never guessed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""HDF5 files of any layout: their datasets are named, and nothing about them is guessed."""
+"""HDF5 files of any layout: their datasets are named, nothing is guessed."""
 
 from __future__ import annotations
 

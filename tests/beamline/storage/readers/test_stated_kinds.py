@@ -1,4 +1,4 @@
-"""Kinds of frames that a caller says, and scans in several files."""
+"""Frame kinds stated by the caller, and scans in several files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Counts beyond the end of a signed type are read without its sign; what is negative for another reason is not."""
+"""Counts beyond a signed type are read as unsigned; values that are negative for other reasons are not."""
 
 from __future__ import annotations
 

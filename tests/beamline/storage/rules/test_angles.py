@@ -1,4 +1,4 @@
-"""Angles that are not those of the views: positions in a list, twice or half of the truth.
+"""Angles that do not belong to the projections: list positions, twice or half of the true angles.
 
 Scans of balls by the formula of a sphere's chord; one sample is wider than the field, one is round.
 """

@@ -1,4 +1,4 @@
-"""Files that a disk, a memory or another program damaged: frames are named, and nothing is taken from them."""
+"""Files damaged by a disk, memory or another program: frames are named and not used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Flags as a finding of `validate`: numbers by check and level, and how bad that is."""
+"""Flags in `validate`: their numbers by check and level, and how serious they are."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Light that is right is not told of; what is wrong stands in tests/beamline/test_findings.py."""
+"""Correct intensities are not reported; wrong ones are in tests/beamline/test_findings.py."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sinograms where views are expected, a horizontal axis, and bytes of numbers in the other order, are told."""
+"""Sinograms instead of projections, a horizontal axis, and numbers in the other byte order are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each rule against a file that breaks it, and against one that breaks nothing."""
+"""Each rule, with a file that breaks it and with a file that breaks none."""
 
 from __future__ import annotations
 

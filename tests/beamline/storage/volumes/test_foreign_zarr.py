@@ -1,4 +1,4 @@
-"""Zarr of other programs: compressed, of both versions, with axes of one time and channel, in scales."""
+"""Zarr of other programs: compressed, both versions, with single time and channel axes, in several scales."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The writer: what it writes, and what it refuses."""
+"""The writer: the content of its files, and its errors."""
 
 from __future__ import annotations
 

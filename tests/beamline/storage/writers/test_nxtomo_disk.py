@@ -1,4 +1,4 @@
-"""The writer on a disk that is full, fails or hangs: what is named, what is safe, and what stays readable."""
+"""The writer on a full, failing or hanging disk: what is reported, what is safe, what stays readable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reconstruction files and checkpoints: whole or absent, never overwritten unless asked, and everything comes back."""
+"""Volume files and checkpoints: complete or absent, overwritten only on request, and everything is read back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A motor record that does not fit, is stopped by a person, meets a switch, loses its controller or its IOC."""
+"""A motor record that does not fit, is stopped by hand, hits a switch, or loses its controller or IOC."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PI GCS 2.0 driver on a disturbed line: what got lost is noticed, and what (has not) moved is said."""
+"""PI GCS 2.0 driver on a disturbed line: lost bytes are noticed, and the message says what moved."""
 
 from __future__ import annotations
 

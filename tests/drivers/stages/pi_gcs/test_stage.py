@@ -1,4 +1,4 @@
-"""PI GCS 2.0 driver: what is this controller's own; what every stage does stands in conformance."""
+"""PI GCS 2.0 driver: specific behaviour of this controller; common behaviour is tested in conformance."""
 
 from __future__ import annotations
 

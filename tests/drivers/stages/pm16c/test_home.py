@@ -1,4 +1,4 @@
-"""PM16C-04XD driver: the search for the home switch, where it ends, and what disturbs it."""
+"""PM16C-04XD driver: the search for the home switch, its end position, and disturbances."""
 
 from __future__ import annotations
 

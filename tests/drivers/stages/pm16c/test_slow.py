@@ -1,4 +1,4 @@
-"""PM16C driver on older firmware, wherever the first pulse comes, and widths in microseconds."""
+"""PM16C driver with older firmware, for any position of the first pulse, and pulse widths in microseconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PM16C-04XD driver: what is this controller's own; what every stage does stands in conformance."""
+"""PM16C-04XD driver: specific behaviour of this controller; common behaviour is tested in conformance."""
 
 from __future__ import annotations
 

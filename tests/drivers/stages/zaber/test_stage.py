@@ -1,4 +1,4 @@
-"""Zaber driver: what is this controller's own, from identity to faults, and a disturbed line."""
+"""Zaber driver: specific behaviour of this controller, from identity to faults, and a disturbed line."""
 
 from __future__ import annotations
 

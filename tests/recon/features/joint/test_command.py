@@ -1,4 +1,4 @@
-"""`beamline recon --volumes N`: a cylinder that fades, from the scan to volumes in time, and what reads these."""
+"""`beamline recon --volumes N`: a fading cylinder, from the scan to volumes in time and the commands that read them."""
 
 from __future__ import annotations
 

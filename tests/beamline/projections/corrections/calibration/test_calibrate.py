@@ -1,4 +1,4 @@
-"""--calibrate: places of views and the axis are learnt from a scan's own views, and enter the geometry alone."""
+"""--calibrate: shifts and the axis are measured from the projections, and change only the geometry."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def test_places_and_axis_enter_the_geometry_and_no_pixel_is_resampled(scan: Path
     assert np.sqrt(np.mean(rest**2)) < 0.1
     assert found.geometry.axis_col + axis == pytest.approx(AXIS, abs=0.1) and found.axis_col == found.geometry.axis_col
     done = found.done["calibrate"]
-    assert done.sentence.startswith("Geometry learnt: the axis moves by +")
-    assert "Views held out deviate by" in done.sentence
+    assert done.sentence.startswith("Geometry calibrated: the axis moves by +")
+    assert "The deviation of held-out projections fell from" in done.sentence
     assert done.parameters is not None and done.parameters["calibrate_confirmed"] == "axis,shifts"
     assert plain.done["calibrate"].sentence == ""
 

@@ -1,4 +1,4 @@
-"""--calibrate gains: refused where the views cannot show them."""
+"""--calibrate gains: error if the projections cannot show them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views after a jump of the sample are left out, and the reason is told in a line."""
+"""Projections after a jump of the sample are left out, and one line says why."""
 
 from __future__ import annotations
 

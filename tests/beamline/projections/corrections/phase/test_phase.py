@@ -1,4 +1,4 @@
-"""Phase of a scan: the same views in batches, bands of rows and slabs; what it must know is the file's or asked for."""
+"""Phase filter of a scan: same result in batches, bands of rows and slabs; its values come from file or options."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Angles in names are judged over the whole series: read as they were written, or asked for; never mirrored or cut."""
+"""Angles in file names are checked over the whole series: used if consistent or requested, never altered."""
 
 from __future__ import annotations
 

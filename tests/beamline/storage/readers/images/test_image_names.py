@@ -1,4 +1,4 @@
-"""What a sample is called does not make it a dark or a flat; angles in names are read; hidden files are no images."""
+"""The sample's name does not make an image a dark or flat; angles in names are read; hidden files are ignored."""
 
 from __future__ import annotations
 

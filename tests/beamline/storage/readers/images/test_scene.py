@@ -1,4 +1,4 @@
-"""A scene of R²-Gaussian, projected here by the geometry of its authors, gives their volume, not its mirror image."""
+"""A scene of R²-Gaussian, projected with its authors' geometry, gives their volume and not its mirror image."""
 
 from __future__ import annotations
 

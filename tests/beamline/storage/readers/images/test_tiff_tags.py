@@ -1,4 +1,4 @@
-"""What a TIFF says of its pages: orientation, copies of reduced resolution, sets of OME files and their axes."""
+"""TIFF tags: orientation, reduced-resolution copies, sets of OME files and their axes."""
 
 from __future__ import annotations
 

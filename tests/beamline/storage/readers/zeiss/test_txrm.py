@@ -1,4 +1,4 @@
-"""Zeiss's .txrm: files written here as two public readers document them, and a real one."""
+"""Zeiss .txrm: files written here as two public readers document them, and a real one."""
 
 from __future__ import annotations
 

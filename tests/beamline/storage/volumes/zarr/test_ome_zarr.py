@@ -1,4 +1,4 @@
-"""OME-Zarr: every scale is the mean of the one before, in its place, for us and for the library of the format."""
+"""OME-Zarr: every scale is the mean of the previous one, at the right position, for us and the format's library."""
 
 from __future__ import annotations
 
