@@ -75,7 +75,7 @@ def watch(path: Path | None, control: bool, port: int, bind: str, tethered: bool
     folder = path or Path(RUNS)
     if path is not None and not path.exists():
         there = ", ".join(run.name for run in runs_in(Path(RUNS))[:5])
-        held_runs = f"the newest runs in {RUNS} are {there}" if there else f"{RUNS} has no runs"
+        held_runs = f"the newest runs in {RUNS} are {there}" if there else f"there are no runs in {RUNS}"
         raise ConfigError(f"{path} does not exist; {held_runs}.")
     what = watched(newest(folder) if path is None or (path.is_dir() and runs_in(path)) else folder)
     if not (held(what.scan) if what.folder is None else alive(what.folder)) and (advice := next_step(what.scan)):
@@ -148,7 +148,7 @@ def runs(folder: Path | None, as_json: bool, as_page: bool, port: int, bind: str
     if as_json:
         return
     if not runs:
-        click.echo(f"{folder} has no runs.", err=True)
+        click.echo(f"There are no runs in {folder}.", err=True)
     for run in runs:
         if sentence := run.next_step or run.ended:
             click.echo(f"{run.folder.name}: {sentence}", err=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -148,12 +149,12 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
     ("words", "code", "said"),
     [
         (("--volumes", "3", "--follow"), 2, "--volumes does not go with --follow"),
-        (("--volumes", "3", "-m", "fbp"), 2, "--volumes is of series; it does not go with --method fbp"),
+        (("--volumes", "3", "-m", "fbp"), 2, "--volumes belongs to series; it does not go with --method fbp"),
         (("--volumes", "3", "--uncertainty"), 2, "error bars belong to one volume"),
         (("--volumes", "3", "--roi", "0:1,0:9,0:9"), 2, "a box belongs to one volume"),
         (("--volumes", "3", "-o", "series.tif"), 2, "ends in .h5"),
         (("--volumes", "1"), 2, "--volumes"),
-        (("--moves",), 2, "give --volumes N"),
+        (("--moves",), 2, "add --volumes N"),
         (("--volumes", "4", "--no-moves"), 5, "12 views or more for each"),
         (("--volumes", "2", "--memory", "100K"), 2, "may be used. Volumes in time are not made in slabs: give --bin"),
         (
@@ -215,5 +216,5 @@ def test_a_stop_during_the_fit_writes_the_volumes_so_far(
 
 def test_the_help_names_methods_for_comparison_and_not_those_of_several_volumes() -> None:
     said = " ".join(beamline("recon", "--help").output.split())
-    compared = said.partition("the others iterate on voxels; ")[2].partition(" are there for comparison")[0]
+    compared = re.findall(r"\(([^()]*) are meant for comparison", said)[0]
     assert "sirt" in compared and not {"series"} & set(compared.split(", "))
