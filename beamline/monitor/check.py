@@ -1,4 +1,4 @@
-"""Check: the interface of the monitor's checks, with what they know of the scan and what they report.
+"""Check: the interface of the checks of the monitor, with their input (ScanContext) and their result (CheckResult).
 
 A check is a frozen dataclass whose fields are its limits; `beamline.monitor.checks` lists all of them. It looks at one
 frame after another and carries what it needs to remember as an immutable state, so that a scan can be replayed.
@@ -90,13 +90,13 @@ class ScanContext:
     change: SampleChange | None = None
 
 
-AGAIN = "`monitor.retake: true` in a configuration has a scan take such views again, after the last one."
-"""Advice of alarms that a view taken again has not."""
+AGAIN = "With `monitor.retake: true` in the configuration, the scan takes such projections again at its end."
+"""Advice for alarms that usually do not occur again when the projection is repeated."""
 
 
 def again_by(check: str) -> str:
-    """The policy of a check with this reaction to warnings."""
-    return f"`monitor.retake: [{check}]` in a configuration has a scan take such views again, after the last one."
+    """Advice for warnings of a check: how to have such projections taken again."""
+    return f"With `monitor.retake: [{check}]` in the configuration, the scan takes such projections again at its end."
 
 
 def light(preview: NDArray[np.float32], context: ScanContext) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Checks of frames by themselves: saturation, repeated images, triggers, darks that drift, and a lost beam.
+"""Checks of single frames: `saturation`, `stuck` (repeated images), `timing`, `dark` (drift of darks), `lost` (beam).
 
 Noise never repeats, so an equal checksum is a frame that was delivered again. Only the alarms of `lost` end a scan by
 default.
@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from beamline.core.text import count
 from beamline.monitor.check import AGAIN, CheckResult, Flag, Level, Logged, Policy, ScanContext
 from beamline.monitor.digest import FrameDigest, subsampled
 from drivers.base.frame import Frame, FrameKind
@@ -37,8 +38,8 @@ class SaturationCheck(Logged):
     unit: ClassVar[str] = "fraction of the pixels"
     meaning: ClassVar[str] = "more pixels are saturated than in the darks"
 
-    warn: float = setting(1e-5, "fraction of saturated pixels above which it warns", ge=0)
-    alarm: float = setting(1e-3, "fraction of saturated pixels above which it is an alarm", ge=0)
+    warn: float = setting(1e-5, "fraction of saturated pixels above which there is a warning", ge=0)
+    alarm: float = setting(1e-3, "fraction of saturated pixels above which there is an alarm", ge=0)
 
     start = SaturationState
 
@@ -52,8 +53,8 @@ class SaturationCheck(Logged):
             return CheckResult(state)
         level, limit = (Level.ALARM, self.alarm) if score > self.alarm else (Level.WARN, self.warn)
         advice = (
-            f"{score:.2%} of the pixels are saturated (>= {context.saturation:g}). Shorten the exposure or add a "
-            "filter."
+            f"Shorten the exposure or add a filter: {score:.2%} of the pixels are saturated (at least "
+            f"{context.saturation:g} counts)."
         )
         return CheckResult(state, Flag(self.name, level, frame.index, score, limit, advice))
 
@@ -81,7 +82,7 @@ class StuckCheck(Logged):
     name: ClassVar[str] = "stuck"
     bit: ClassVar[int] = 2
     unit: ClassVar[str] = "repetitions"
-    meaning: ClassVar[str] = "the image equals the one before, pixel for pixel: the camera delivered a frame twice"
+    meaning: ClassVar[str] = "the image is identical to the one before: the camera delivered a frame twice"
 
     start = StuckState
 
@@ -99,8 +100,8 @@ class StuckCheck(Logged):
             return CheckResult(replace(state, repeats=0))
         state = replace(state, repeats=state.repeats + 1)
         advice = (
-            f"Pixel for pixel the frame before, {state.repeats} time{'s' if state.repeats > 1 else ''} in a row: "
-            "the camera or its driver repeats a buffer. Stop and restart the camera."
+            "Stop and restart the camera: it or its driver delivers the same image again, "
+            f"{count(state.repeats, 'time')} in a row (all pixels are identical)."
         )
         return CheckResult(state, Flag(self.name, Level.ALARM, frame.index, state.repeats, 0, advice))
 
@@ -143,7 +144,9 @@ class TimingCheck(Logged):
         lost = steps - 1 - sum(state.trigger < view < frame.trigger for view in context.stored)
         if lost > 0:
             after = replace(after, gaps=(*state.gaps, range(state.trigger + 1, frame.trigger)))
-            advice = f"{lost} trigger{'s' if lost > 1 else ''} before this one exposed no frame, or it was lost."
+            advice = (
+                f"{count(lost, 'frame')} missing before this one: the trigger exposed no frame, or the frame was lost."
+            )
             return CheckResult(after, Flag(self.name, Level.INFO, frame.index, lost, 0, advice))
         if state.trigger < 0 or steps < 1 or 0 <= frame.framestamp <= state.framestamp:
             return CheckResult(after)  # armed anew, for another pass, or the same one again, or after a pause
@@ -151,8 +154,8 @@ class TimingCheck(Logged):
         if abs(score) <= self.warn:
             return CheckResult(after)
         advice = (
-            f"The frame came {abs(score):.0%} of a period too {'late' if score > 0 else 'early'}: the stage does not "
-            "turn evenly, or the trigger line picks up noise."
+            f"Check the stage and the trigger line: the frame came {abs(score):.0%} of a period too "
+            f"{'late' if score > 0 else 'early'}. The stage does not turn evenly, or the trigger line picks up noise."
         )
         return CheckResult(after, Flag(self.name, Level.WARN, frame.index, score, self.warn, advice))
 
@@ -193,8 +196,8 @@ class DarkCheck(Logged):
         if abs(drift) <= self.drift:
             return CheckResult(state)
         advice = (
-            f"The dark moved by {drift:+.1f} counts since the first dark: check the camera's cooling and for stray "
-            "light."
+            f"Check the cooling of the camera, and for stray light: the dark level changed by {drift:+.1f} counts "
+            "since the first dark."
         )
         return CheckResult(state, Flag(self.name, Level.WARN, frame.index, drift, self.drift, advice))
 
@@ -221,11 +224,11 @@ class LostCheck:
 
     name: ClassVar[str] = "lost"
     bit: ClassVar[int] = 7
-    unit: ClassVar[str] = "fraction of the light"
+    unit: ClassVar[str] = "fraction of the intensity"
     meaning: ClassVar[str] = "the beam is gone"
     policy: ClassVar[Policy] = Policy.STOP
 
-    alarm: float = setting(0.5, "fraction of the light without which it is lost", ge=0.5, le=1)
+    alarm: float = setting(0.5, "fraction of the intensity whose loss means that the beam is lost", ge=0.5, le=1)
 
     start = LostState
 
@@ -233,9 +236,13 @@ class LostCheck:
         score = 1 - context.light_left
         if frame.kind is not FrameKind.PROJECTION or score <= self.alarm:
             return CheckResult(state)
-        empty = "Every pixel has one value: the frame was never written, or the camera gave none. Look at the file."
+        empty = (
+            "Look at the file: every pixel of this frame has the same value. The frame was never written, or the "
+            "camera sent none."
+        )
         advice = (
-            f"The beam is lost: {score:.0%} of the light is gone. Check ring current, front end and shutter. {AGAIN}"
+            f"Check ring current, front end and shutter: the beam is lost ({score:.0%} of the intensity is gone). "
+            f"{AGAIN}"
             if digest.variance
             else empty
         )

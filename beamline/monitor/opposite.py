@@ -89,13 +89,11 @@ class OppositeCheck(Logged):
     name: ClassVar[str] = "opposite"
     bit: ClassVar[int] = 15
     unit: ClassVar[str] = "pixels"
-    meaning: ClassVar[str] = (
-        "the view from the other side, or the same view before, shows the sample elsewhere or changed"
-    )
+    meaning: ClassVar[str] = "compared with the opposite projection, or with a repetition, the sample moved or changed"
 
     warn: float = setting(0.5, "pixels by which the sample may have moved or changed", ge=0)
-    changed: float = setting(1.0, "pixels, as a shift of all, by which parts may differ", ge=0)
-    axis: float = setting(1.0, "pixels between the axis and its stated place that are said", ge=0)
+    changed: float = setting(1.0, "pixels by which parts may differ, as an equivalent shift of the whole sample", ge=0)
+    axis: float = setting(1.0, "pixels by which the axis may differ from its stated position", ge=0)
 
     start = OppositeState
 
@@ -106,8 +104,8 @@ class OppositeCheck(Logged):
         if view is None or grid is None or state.aside or not math.isfinite(view.angle):
             return CheckResult(state)
         if context.cone or not grid.flats:
-            why = "the beam is a cone, in which they differ" if context.cone else "there are no flats"
-            advice = f"Views from opposite sides are not compared: {why}."
+            why = "they differ in a cone beam" if context.cone else "there are no flats"
+            advice = f"Nothing to do: opposite projections are not compared, because {why}."
             return CheckResult(
                 replace(state, aside=True), Flag(self.name, Level.INFO, frame.index, 0.0, self.warn, advice)
             )
@@ -140,7 +138,7 @@ class OppositeCheck(Logged):
         looked = (
             self._mirrored(state, one, fit, view, context)
             if mirrored
-            else CheckResult(state, self._moved(fit, view.index, f"frame {one.view.index}, taken again", context))
+            else CheckResult(state, self._moved(fit, view.index, f"frame {one.view.index} at the same angle", context))
         )
         if unsure and looked.flag is None:
             return None
@@ -177,7 +175,7 @@ class OppositeCheck(Logged):
         first = state.axis is None
         usual = axis if state.axis is None else state.axis
         moved = replace(fit, across=2 * (axis - usual))
-        flag = self._moved(moved, view.index, f"frame {one.view.index}, from the other side", context)
+        flag = self._moved(moved, view.index, f"the opposite frame {one.view.index}", context)
         state = state if fit.unsure else replace(state, axis=usual)
         stated = context.axis_col
         shaken = SHAKEN * math.sqrt(fit.places) * context.shake[0] / 2
@@ -185,9 +183,9 @@ class OppositeCheck(Logged):
         if fit.unsure or flag is not None or not first or stated is None or abs(axis - stated) <= limit:
             return CheckResult(state, flag)
         advice = (
-            f"By frames {one.view.index} and {view.index}, from opposite sides, the axis is at column "
-            f"{axis:.1f}; the scan states {stated:.1f}. The stated axis is wrong, or the sample moved by twice the "
-            "difference."
+            f"Check the rotation axis: the opposite frames {one.view.index} and {view.index} show it at column "
+            f"{axis:.1f}, but the scan states {stated:.1f}. Either the stated axis is wrong, or the sample moved by "
+            "twice the difference."
         )
         return CheckResult(state, Flag(self.name, Level.INFO, view.index, axis - stated, self.axis, advice))
 
@@ -202,14 +200,15 @@ class OppositeCheck(Logged):
             return None
         score, limit = (moved, limits[0]) if moved > limits[0] else (fit.remainder, limits[1])
         change = (
-            f"the sample is {fit.across:+.1f} px across and {fit.down:+.1f} px down"
+            f"the sample moved by {fit.across:+.1f} px horizontally and {fit.down:+.1f} px vertically"
             if moved > limits[0]
-            else f"parts of it differ as if all had moved by {fit.remainder:.1f} px: it shrank, bent or lost something"
+            else f"parts of the sample differ as much as after a shift of {fit.remainder:.1f} px: it shrank, bent or "
+            "lost something"
         )
         advice = (
-            f"Against {other}, {change}. Look at both. Of views around a jump that `motion` saw, `beamline recon` "
-            "leaves out the shorter side. A sample that crept or changed is followed by `beamline recon --volumes N`; "
-            "or scan again, faster."
+            f"Compare the two frames: relative to {other}, {change}. If `motion` reported a jump, `beamline recon` "
+            "uses only the longer part of the scan. If the sample moved or changed slowly, use `beamline recon "
+            "--volumes N`, or repeat the scan faster."
         )
         return Flag(self.name, Level.WARN, row, score, limit, advice)
 

@@ -1,4 +1,4 @@
-"""Darks and flats: saturated, without light, uneven, lit though they should be dark, never written, or with the sample.
+"""Rules for darks and flats: saturated, without beam, uneven, never written, with beam in darks, or with the sample.
 
 Bad references spoil a volume as surely as bad views. So the same rules judge them before the first projection is taken,
 in `validate` and before a reconstruction: each frame beside its group, the other groups and the views. A new check is a
@@ -63,12 +63,14 @@ class ReferenceLimits:
         variance. An offset has only the former, readout noise only the latter. A fifth of both is neither.
     """
 
-    saturated: float = setting(1e-3, "fraction of the pixels of a flat at their end", ge=0, lt=1)
-    light_over_noise: float = setting(3.0, "light of a flat over the noise of a dark's pixel", ge=0)
-    light_gone: float = setting(0.5, "light that is gone, of the brightest flats", gt=0, lt=1)
-    uneven: float = setting(0.1, "relative change of the light between flats of a group", gt=0)
-    unlit: float = setting(0.5, "fraction of the frame that flats leave dark", gt=0, le=1)
-    light_in_darks: float = setting(0.2, "level and variance of darks over those of flats", gt=0, lt=1)
+    saturated: float = setting(1e-3, "fraction of the pixels of a flat that may be saturated", ge=0, lt=1)
+    light_over_noise: float = setting(
+        3.0, "least intensity of a flat, in units of the noise of a pixel in a dark", ge=0
+    )
+    light_gone: float = setting(0.5, "fraction of the intensity of the brightest flats that may be missing", gt=0, lt=1)
+    uneven: float = setting(0.1, "relative change of the intensity between flats of a group", gt=0)
+    unlit: float = setting(0.5, "fraction of the frame that may be without beam in flats", gt=0, le=1)
+    light_in_darks: float = setting(0.2, "level and variance of darks, relative to those of flats", gt=0, lt=1)
 
 
 DARK, FLAT = FrameKind.DARK, FrameKind.FLAT
@@ -111,9 +113,9 @@ def _with_holes(kind: FrameKind) -> Rule:
             limit = min(min(frame.invalid for frame in group) + INVALID, 0.5)
             if odd := [frame for frame in group if frame.invalid > limit or frame.blank]:
                 text = range_in_words([frame.invalid for frame in odd])
-                sentence = f"a share of {text} of the pixels is not finite (limit {limit:.3g})."
+                sentence = f"a fraction of {text} of the pixels has no valid value (limit {limit:.3g})."
                 if all(frame.blank for frame in odd):
-                    sentence = f"no pixel of them holds a number: all are NaN, infinite or beyond {LARGEST:g}."
+                    sentence = f"no pixel has a valid value: all are NaN, infinite or above {LARGEST:g}."
                 yield BadFrames(odd, max(frame.invalid for frame in odd), limit, sentence)
 
     return with_holes
@@ -124,7 +126,7 @@ def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
     frames = evidence.frames(DARK)
     zero = [frame for frame in frames if not np.any(frame.blocks)]
     if zero and 2 * sum(not frame.constant for frame in frames) > len(frames):
-        yield BadFrames(zero, 0.0, 0.0, "every pixel is 0: never written, or no frame of the camera.")
+        yield BadFrames(zero, 0.0, 0.0, "every pixel is 0: the frame was never written, or it is not from the camera.")
 
 
 def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
@@ -141,8 +143,8 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
             odd = [same[at] for at in np.flatnonzero(levels - lowest > limit).tolist()]
             least_dark = f"the darkest dark, frame {base.row} with {lowest:.6g}"
             yield BadFrames(odd, float(above.max()), limit, (
-                f"there is light in them, or their offset moved: {range_in_words(above)} counts above {least_dark} "
-                f"(limit {limit:.3g}, by the {light:.6g} of light in the flats)."
+                f"they were exposed to the beam, or their offset changed: they are {range_in_words(above)} counts "
+                f"above {least_dark} (limit {limit:.3g}, because the flats have {light:.6g} counts of beam)."
             ))  # fmt: skip
 
 
@@ -159,11 +161,11 @@ def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
         if all(frame.constant for frame in (*group, *darks)) and not (over.any() and level(darks or group)):
             continue
         if over.any():
-            what = f"{most:.2%} of their pixels are saturated (limit {limit:.2%}), and their light is not known"
+            what = f"{most:.2%} of their pixels are saturated (limit {limit:.2%}), so the intensity is not known"
             odd = [group[at] for at in np.flatnonzero(over).tolist()]
             yield BadFrames(odd, most, limit, f"{what}. Shorten the exposure or add a filter.")
         elif all(flat.constant for flat in group):
-            what = f"every pixel of them holds {level(group):g}, though those of the darks vary: counts end there"
+            what = f"every pixel is {level(group):g}, although pixels of the darks vary: all pixels are saturated"
             yield BadFrames(group, 1.0, limit, f"{what}. Shorten the exposure or add a filter.")
 
 
@@ -181,9 +183,9 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
         light = level(group) - level(darks)
         if light <= limit * noise:
             yield BadFrames(group, light / noise if noise else 0.0, limit, (
-                f"there is no beam in them: their level {level(group):.6g} is {light:.3g} above the darks' "
-                f"{level(darks):.6g}, and a pixel's noise is {noise:.2g} (limit: {limit:g} times it). Was the shutter "
-                "open for them, and closed for the darks?"
+                "they show no beam. Was the shutter open for the flats, and closed for the darks? The level of these "
+                f"flats, {level(group):.6g}, is {light:.3g} above that of the darks, {level(darks):.6g}; the noise of "
+                f"a pixel is {noise:.2g} (limit: {limit:g} times the noise)."
             ))  # fmt: skip
 
 
@@ -194,7 +196,9 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
         gone = np.array([1 - evidence.light_of([flat]) / evidence.light_of(bright) for flat in group])
         if (gone > limit).any():
             others, most = spans([flat.row for flat in bright]), float(gone.max())
-            sentence = f"{most:.0%} of the light of the flats {others} is gone (limit {limit:.0%}): the beam was lost."
+            sentence = (
+                f"the beam was lost: they have {most:.0%} less intensity than the flats {others} (limit {limit:.0%})."
+            )
             yield BadFrames([group[at] for at in np.flatnonzero(gone > limit).tolist()], most, limit, sentence)
 
 
@@ -206,8 +210,9 @@ def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[
         share = evidence.light_of(group) / evidence.light_of(views)
         if share < limit and all(flat.exposure > 0 for flat in group):
             yield BadFrames(group, share, limit, (
-                f"they have {share:.2%} of the light of the views (limit {limit:.0%}), though a sample only "
-                "takes light. The beam was lost or a filter was in for them, or their exposure is not the one stated."
+                f"they have {share:.2%} of the intensity of the projections (limit {limit:.0%}), but a sample can only "
+                "absorb. During these flats the beam was lost or a filter was in the beam, or the stated exposure is "
+                "wrong."
             ))  # fmt: skip
 
 
@@ -232,13 +237,13 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
         how = "from flat to flat" if whole else "from the usual flat of their group"
         if far.any():
             n = lights_in_turn(levels)
-            why = f"{n} thresholds, exposures or energies in turn" if n else "an unstable beam"
-            sentence = f"their light differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
+            why = f"{n} thresholds, exposures or energies alternate" if n else "the beam is unstable"
+            sentence = f"their intensity differs by {changed:.0%} {how} (limit {limit:.0%}): {why}."
             yield BadFrames(group if whole else odd, changed, limit, sentence)
         elif odd:
             yield BadFrames(group if whole else odd, float(places.max()), limit, (
-                f"in places their light differs by {places.max():.0%} {how} (limit {limit:.0%}): something was in the "
-                "beam. Is the sample out?"
+                f"something was in the beam. Is the sample out? The intensity differs locally by {places.max():.0%} "
+                f"{how} (limit {limit:.0%})."
             ))  # fmt: skip
 
 
@@ -249,8 +254,8 @@ def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
         score, limit = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean()), limits.unlit
         if score > limit:
             yield BadFrames(group, score, limit, (
-                f"{score:.0%} of the frame has no light in them (limit {limit:.0%}): move beam and detector onto one "
-                "another, or read fewer pixels."
+                f"{score:.0%} of the frame gets no beam (limit {limit:.0%}). Align beam and detector, or read out a "
+                "smaller region."
             ))  # fmt: skip
 
 
@@ -266,10 +271,10 @@ def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[Bad
         unsure = known and noise < READOUT and level(flats) - level(darks) < FEW * noise
         if min(share, variance) > limit and level(darks) > 0 and not unsure:
             yield BadFrames(darks, min(share, variance), limit, (
-                f"there is light in them: their level {level(darks):.6g} is {share:.0%} of the flats' "
-                f"{level(flats):.6g}"
-                + (f" and their variance {variance:.0%}" if known else "")
-                + f" (limit {limit:.0%}). Was the shutter closed for them, and open for the flats?"
+                "they were exposed to the beam. Was the shutter closed for the darks, and open for the flats? The "
+                f"level of these darks, {level(darks):.6g}, is {share:.0%} of that of the flats, {level(flats):.6g}"
+                + (f", and the variance is {variance:.0%}" if known else "")
+                + f" (limit {limit:.0%})."
             ))  # fmt: skip
 
 

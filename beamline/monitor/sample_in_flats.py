@@ -1,4 +1,4 @@
-"""Flats with the sample in the beam: they look like views, or leave the views without the matter that turns in them.
+"""Rules that find flats with the sample in the beam, by comparing the intensity of flats and projections.
 
 Rules of `beamline.monitor.references`, which compare the light of flats and views at coarse places, as line integrals.
 """
@@ -48,13 +48,13 @@ def _like_views(evidence: Evidence, _: Any, single: bool) -> Iterator[BadFrames]
     else:
         means = [np.mean(own, axis=0) for own in light]
         compared = [(list(group), means[i], means[:i] + means[i + 1 :]) for i, group in enumerate(groups)]
-    beside, odd = "others of their group" if single else "other flats", list[BadFrames]()
+    beside, odd = "other flats of their group" if single else "other flats", list[BadFrames]()
     for frames, image, others in compared:
         if others and (found := _nearest_view(image, others, seen)) is not None:
             off, like, nearest = found
             odd.append(BadFrames(frames, off, like / LIKER, (
-                f"they differ from the {beside} by {off:.3g} of line integral, and by {like:.2g} only from the view in "
-                f"frame {views[nearest].row}: the sample was in the beam."
+                f"the sample was in the beam: they differ from the {beside} by {off:.3g} in line integral, but from "
+                f"the projection in frame {views[nearest].row} only by {like:.2g}."
             )))  # fmt: skip
     if len(odd) < len(compared):  # else a drift of the beam: each is like the views beside it
         yield from odd
@@ -119,9 +119,9 @@ def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     for group, top, mismatch in zip(groups, above.brightest.tolist(), above.mismatch.tolist(), strict=True):
         if min(top, top - least, mismatch) > above.limit:
             yield BadFrames(group, top, above.limit, (
-                f"in places the views are brighter than they by {top:.3g} of line integral (limit {above.limit:.2g}), "
-                f"and than other flats by {max(least, 0.0):.2g} only, though a sample only takes light: the sample, or "
-                "something else, was in the beam."
+                "the sample, or something else, was in the beam: projections are locally brighter than these flats by "
+                f"{top:.3g} in line integral (limit {above.limit:.2g}), but brighter than the other flats only by "
+                f"{max(least, 0.0):.2g}, and a sample can only absorb."
             ))  # fmt: skip
 
 
@@ -132,9 +132,9 @@ def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
         top = float(above.brightest[most])
         if min(top, top - float(above.at_edges[most])) > above.limit:
             yield BadFrames((), top, above.limit, (
-                f"In places the views are brighter than the flats by {top:.2g} of line integral, though a sample only "
-                "takes light. Was the sample, or something else, in the beam for the flats, or did the beam change its "
-                "shape?"
+                "Was the sample, or something else, in the beam during the flats, or did the beam change its shape? "
+                f"The projections are locally brighter than the flats by {top:.2g} in line integral, but a sample can "
+                "only absorb."
             ))  # fmt: skip
 
 
@@ -152,9 +152,9 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     brighter, limit = -float(np.percentile(mean, 100 - WORST)), max(AIR, SIGMAS * place_noise(mean))
     if brighter > limit and float((-mean).clip(0).sum()) > BRIGHTER * float(mean.clip(0).sum()):
         yield BadFrames(flats, brighter, limit, (
-            f"in places the views are brighter by {brighter:.2g} of line integral (limit {limit:.2g}) and hold no more "
-            "matter elsewhere, though a sample only takes light: the sample was in the beam, or the beam changed its "
-            "shape between flats and views."
+            "the sample was in the beam, or the beam changed its shape between flats and projections: the projections "
+            f"are locally brighter by {brighter:.2g} in line integral (limit {limit:.2g}), and elsewhere they do not "
+            "absorb more, but a sample can only absorb."
         ))  # fmt: skip
         return
     turning = depth - mean
@@ -163,8 +163,9 @@ def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     seen = float(masses.mean())
     if np.percentile(deepest, WORST) > DRIFT and LIGHTER * least - seen > SIGMAS * float(masses.std()):
         yield BadFrames(flats, seen, LIGHTER * least, (
-            f"what turns in the views takes at least {least:.2g} of line integral, the mean over the frame, but "
-            f"against these flats there is {seen:.2g} (limit {LIGHTER * least:.2g}): the sample was in the beam."
+            f"the sample was in the beam: the rotating part of the sample absorbs at least {least:.2g} (line integral, "
+            f"mean over the frame), but relative to these flats only {seen:.2g} is absorbed (limit "
+            f"{LIGHTER * least:.2g})."
         ))  # fmt: skip
 
 
@@ -177,9 +178,9 @@ def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
     shown = [float(np.abs(part).max()) for part in (mean - np.median(mean), depth - mean)]
     if all(most < limit for most, limit in zip(shown, limits, strict=True)):
         yield BadFrames((), max(shown), max(limits), (
-            f"No view looked at differs from the flats by more than noise (line integrals below {max(shown):.2g}). "
-            "Either there is no sample in the views, or it was in the beam for the flats, too, and looks the same from "
-            "all sides."
+            "The projections show no sample: those that were checked differ from the flats only by noise (line "
+            f"integrals below {max(shown):.2g}). Either there is no sample, or it was also in the beam during the "
+            "flats and looks the same from all sides."
         ))  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Monitor: all checks together. It takes frames and returns flags; its state is a value."""
+"""Monitor: runs all checks on each frame and returns their flags. Its state is an immutable value."""
 
 from __future__ import annotations
 
@@ -145,7 +145,9 @@ def look_past_failures(
         except CheckError as failed:
             monitor = without(monitor, failed.name)
             cause = failed.__cause__
-            failures.append(f"{failed} at frame {frame.index} and is off, the other checks go on: {cause!r}")
+            failures.append(
+                f"{failed} at frame {frame.index} and is switched off; the other checks continue: {cause!r}"
+            )
         else:
             return monitor, flags, tuple(failures)
 

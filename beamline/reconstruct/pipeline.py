@@ -75,7 +75,9 @@ def growing_views(options: ReconOptions, channels: Channels) -> Iterator[Job]:
                 follower.draw_slices()
             else:
                 n = follower.n_views_taken
-                channels.warn(f"Stopped while the scan was running: the volume shows the first {count(n, 'view')}.")
+                channels.warn(
+                    f"Stopped during the scan: the volume is reconstructed from the first {count(n, 'projection')}."
+                )
             prepared = follower.prepared()
 
         def facts() -> ScanFacts:
@@ -100,7 +102,11 @@ def _when_it_has_ended(options: ReconOptions, channels: Channels, timing: Follow
     """
     with channels.stop_scope() as should_stop, _open(options, channels, timing) as source:
         channels.sink(
-            StateEntered("waiting", f"{options.method.name} begins when the scan has ended", time=channels.clock.now())
+            StateEntered(
+                "waiting",
+                f"{options.method.name} needs all projections: the reconstruction starts when the scan has ended",
+                time=channels.clock.now(),
+            )
         )
         for _ in growing(source, channels.clock, timing.patience, timing.poll):
             if should_stop():
@@ -115,12 +121,19 @@ def _compile(options: ReconOptions, channels: Channels, timing: FollowTiming) ->
     """
     sink, clock = channels.sink, channels.clock
     compiled = compilation_events(sink, clock)
-    sink(StateEntered("warming_up", "Compiling the fit's kernels, if need be", time=clock.now()))
+    sink(
+        StateEntered(
+            "warming_up",
+            "Loading the compiled code of the fit (if none is included for this computer, it is compiled now: 1 to 2 "
+            "minutes)",
+            time=clock.now(),
+        )
+    )
     warm_up(R2(finish=0), on_kernel=compiled)
     picture = options.target.live_picture
     message = (
-        f"The live volume is ready for views. To watch it grow, open {picture}: slices from the eighth "
-        f"view on, and the volume, drawn anew about every {timing.snapshot:g} s"
+        f"The live reconstruction is ready. To watch it, open {picture}: it shows slices from the eighth projection "
+        f"on, later the volume, updated about every {timing.snapshot:g} s"
     )
     sink(StateEntered("ready", message, {"picture": picture}, time=clock.now()))
 
@@ -153,8 +166,8 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
             return False
         if why := writer.lost(clock.now(), grew, lambda: follower.source.finished):
             raise DataError(
-                f"{follower.source.path} {why} and is not finished. {next_step(follower.source.path)} Without --follow "
-                f"and with --unfinished the {follower.views.n} views that are there are used."
+                f"{follower.source.path} {why} and is not finished. {next_step(follower.source.path)} To use the "
+                f"{count(follower.views.n, 'projection')} in the file, replace --follow by --unfinished."
             )
         follower.measure_law()
         follower.draw_slices(timing.picture)
@@ -227,7 +240,9 @@ def _for_method(
     if options.method.stops_early and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")
         n = prepared.projections.view_ids.size
-        message = f"{prepared.n_projections - n} of {prepared.n_projections} views are held out to say when to stop"
+        message = (
+            f"{prepared.n_projections - n} of {prepared.n_projections} projections are held out to decide when to stop"
+        )
         channels.sink(StateEntered("held_out", message, time=channels.clock.now()))
     options.target.require_room(plan.output, plan.scratch - plan.line_integrals)  # these are there
     return prepared

@@ -1,4 +1,4 @@
-"""Bands: rows or columns that suddenly lose or gain light while others do not: a lost packet, a slit that moved.
+"""Check `bands`: rows or columns that suddenly get darker or brighter than the others, for example after a lost packet.
 
 A sample changes its columns from view to view, and never its rows by much. So the mean light of each preview row and
 column is compared with the value expected from the views before. A change of
@@ -80,11 +80,11 @@ class BandsCheck(Logged):
 
     name: ClassVar[str] = "bands"
     bit: ClassVar[int] = 3
-    unit: ClassVar[str] = "fraction of the line's light"
-    meaning: ClassVar[str] = "rows or columns lost or gained light against their own past while the others did not"
+    unit: ClassVar[str] = "fraction of the intensity in the row or column"
+    meaning: ClassVar[str] = "rows or columns suddenly became darker or brighter, while the others did not"
 
     alarm: float = setting(
-        0.1, "fraction of light that a preview row or column may lose against the others", ge=0, lt=1
+        0.1, "fraction of the intensity that a preview row or column may lose against the others", ge=0, lt=1
     )
 
     start = BandsState
@@ -133,9 +133,9 @@ class BandsCheck(Logged):
     def _flag(self, view: int, score: float, limit: float, region: PixelBox, word: str) -> Flag:
         first, after = region[:2] if word == "rows" else region[2:]
         advice = (
-            f"Within {word} {first} ... {after - 1} the light {'fell' if score > 0 else 'rose'} by up to "
-            f"{abs(score):.0%} at once, and not elsewhere: a band. Check the camera's link and readout, and "
-            f"slits. {AGAIN}"
+            f"Check the link and the readout of the camera, and the slits: {word} {first} ... {after - 1} suddenly "
+            f"became up to {abs(score):.0%} {'darker' if score > 0 else 'brighter'}, the rest of the frame did not. "
+            f"{AGAIN}"
         )
         return Flag(self.name, Level.ALARM, view, score, limit, advice, region)
 

@@ -1,4 +1,4 @@
-"""Blur: loss of the finest detail, by defocus or by motion during the exposure.
+"""Check `blur`: loss of fine detail because of defocus or motion during the exposure.
 
 The figure is the contrast of second differences over two pixels against that of first differences over four, along the
 rows and along the columns: 1 for a sharp edge, less the more it is blurred, 0 for a slope. A contrast is the mean
@@ -66,10 +66,10 @@ class BlurCheck(Logged):
 
     name: ClassVar[str] = "blur"
     bit: ClassVar[int] = 14
-    unit: ClassVar[str] = "share of the fine contrast"
-    meaning: ClassVar[str] = "the view is less sharp than the views before"
+    unit: ClassVar[str] = "fraction of the fine contrast"
+    meaning: ClassVar[str] = "the projection is less sharp than the projections before"
 
-    warn: float = setting(0.3, "share of the fine contrast that a view may lose", ge=0, lt=1)
+    warn: float = setting(0.3, "fraction of the fine contrast that a projection may lose", ge=0, lt=1)
 
     start = BlurState
 
@@ -112,8 +112,9 @@ class BlurCheck(Logged):
         worst = int(np.argmax(np.where(over, losses, -np.inf)))
         where = "" if all(over) else (" along the rows", " along the columns")[worst]
         advice = (
-            f"The finest detail has {losses[worst]:.0%} less contrast{where} than in the views before: the focus "
-            "moved, or the sample moved while the frame was exposed. Check focus and vibration. " + again_by(self.name)
+            f"Check focus and vibration: fine details have {losses[worst]:.0%} less contrast{where} than in the "
+            "projections "
+            "before. The focus moved, or the sample moved during the exposure. " + again_by(self.name)
         )
         return CheckResult(after, Flag(self.name, Level.WARN, frame.index, losses[worst], limits[worst], advice))
 
@@ -128,8 +129,8 @@ class BlurCheck(Logged):
         if state.reported or limit >= LEAST or min(losses) <= limit:
             return CheckResult(state)
         advice = (
-            f"The finest detail has {min(losses):.0%} less contrast than in the first views: the focus drifts, or the "
-            "sample shows its sharp edges no more from here. Compare with the view half a turn away."
+            f"Compare with the opposite projection (180° away): fine details have {min(losses):.0%} less contrast than "
+            "in the first projections. Either the focus drifts, or the sample has no sharp edges in this direction."
         )
         return CheckResult(replace(state, reported=True), Flag(self.name, Level.INFO, row, min(losses), limit, advice))
 

@@ -1,4 +1,4 @@
-"""Floater: a crumb that crosses the field in some views, on a path that no point of the turning sample takes.
+"""Check `floater`: a loose particle that crosses the field of view on a path that no point of the sample takes.
 
 Its track is found by the sum over all views that show it (`track`), and held against the sample: a point of it moves on
 a sinusoid about the axis, no farther from it than the sample reaches. A crumb absorbs the same in every view; edges and
@@ -78,9 +78,11 @@ class FloaterCheck(Logged):
     name: ClassVar[str] = "floater"
     bit: ClassVar[int] = 10
     unit: ClassVar[str] = "standard deviations"
-    meaning: ClassVar[str] = "a crumb crosses the field, on a way that nothing in the turning sample takes"
+    meaning: ClassVar[str] = (
+        "a loose particle crosses the field of view, on a path that no point of the rotating sample takes"
+    )
 
-    warn: float = setting(7.0, "standard deviations of the sum of a crumb's views", ge=0)
+    warn: float = setting(7.0, "standard deviations of the sum along the path of a particle", ge=0)
 
     start = FloaterState
 
@@ -125,11 +127,11 @@ class FloaterCheck(Logged):
         where = [_region(grid, crumb, col) for col in (crumb.col, crumb.col - track.speed * span * share)]
         cell = grid.cell
         advice = (
-            f"A crumb crosses the field: rows {top * cell} ... {below * cell - 1}, frames {after.crumbs[-1].first} ... "
-            f"{crumb.last} so far, {abs(track.speed) * cell:.1f} px a view to the "
-            f"{'right' if track.speed > 0 else 'left'}. No point of the turning sample moves so: it falls, floats, or "
-            "sits on the holder. Find it and blow it off; scan again if its streaks disturb, recon gives its rays "
-            "less weight."
+            f"Find the particle and blow it off: it crosses the field of view in rows {top * cell} ... "
+            f"{below * cell - 1}, frames {after.crumbs[-1].first} ... {crumb.last} so far, and moves "
+            f"{abs(track.speed) * cell:.1f} px per projection to the {'right' if track.speed > 0 else 'left'}. No "
+            "point of the rotating sample moves like this, so it is falling, floating or sitting on the holder. "
+            "`beamline recon` gives its rays less weight; repeat the scan if streaks remain."
         )
         flag = Flag(self.name, Level.WARN, crumb.last, track.score, self.warn, advice, where[0], begin, where[1])
         return CheckResult(after, flag)

@@ -1,4 +1,4 @@
-"""Ghost: a broad hump of too much or too little light that crosses the field from side to side.
+"""Check `ghost`: a broad shadow or reflection that crosses the field of view from side to side.
 
 As for a floater the filters suppress everything that turns with the stage (`fan`). But they use the
 mean of all rows on broad columns, for a hump as broad as a part of the field. In one cell 2 % of light are below the
@@ -138,13 +138,13 @@ class GhostCheck(Logged):
 
     name: ClassVar[str] = "ghost"
     bit: ClassVar[int] = 11
-    unit: ClassVar[str] = "relative change of the light"
+    unit: ClassVar[str] = "relative change of the intensity"
     meaning: ClassVar[str] = (
-        "a ghost crosses the field: a broad hump of more or less light that does not turn with the sample"
+        "a broad shadow or reflection crosses the field of view and does not rotate with the sample"
     )
 
-    warn: float = setting(0.01, "relative change of the light in the middle of the ghost", ge=0)
-    alarm: float = setting(0.8, "relative change that is an alarm", ge=0)
+    warn: float = setting(0.01, "relative change of the intensity in the middle of the ghost", ge=0)
+    alarm: float = setting(0.8, "relative change above which there is an alarm", ge=0)
 
     start = GhostState
 
@@ -202,10 +202,11 @@ class GhostCheck(Logged):
         broad = cols / COLUMNS
         region = context.grid.region((rows - 1) / 2, (col + 0.5) * broad, rows, 2 * WIDTHS[0] * cols)
         advice = (
-            f"A ghost crosses the field, a broad hump: it changes the light by {light:.1%}, "
-            f"{abs(trail.speed) * broad * context.grid.cell:.0f} px a view, which no part of the sample does. "
-            "Something between source and detector reflects or shadows the beam and moves with the stage: find it. "
-            + again_by(self.name)
+            "Look for something between source and detector that reflects or shadows the beam and moves with the "
+            f"stage: a broad shadow or reflection crosses the field of view. It changes the intensity by {light:.1%} "
+            f"and moves {abs(trail.speed) * broad * context.grid.cell:.0f} px per projection, faster than any part of "
+            "the "
+            "sample. " + again_by(self.name)
         )
         return CheckResult(state, Flag(self.name, level, now, light, limit, advice, region, trail.first))
 
