@@ -130,12 +130,12 @@ EVENTS = [
     (
         "recon_started",
         {"file": "s.h5", "method": "r2", "n_views": 26, "axis_col": 81.987, "source": "recon"},
-        "r2: 26 views, rotation axis at column 81.99",
+        "r2 starts: 26 projections, rotation axis at column 81.99",
     ),
     (
         "recon_started",
         {"file": "s.h5", "method": "r2", "n_views": 40, "axis_col": 82.5, "again": True},
-        "r2 again, from the start: 40 views, rotation axis at column 82.50",
+        "r2 starts again from the beginning: 40 projections, rotation axis at column 82.50",
     ),
     ("snapshot", SNAPSHOT, "Volume from 40 views so far: v.h5"),
     (

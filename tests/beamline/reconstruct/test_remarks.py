@@ -82,7 +82,7 @@ def test_a_model_of_needles_is_told(width: float, told: bool, rng: np.random.Gen
     made, prepared = _made(rng, {}, "r2")
     model = Gaussians.from_physical(np.zeros((5, 3)), np.tile([width, 4.0, width], (5, 1)), np.ones(5))
     said = warnings_of(replace(made, gaussians=model), prepared)
-    assert any("100% of the mass of the model is in Gaussians thinner than a pixel" in each for each in said) is told
+    assert any("100% of the mass is in needle-shaped Gaussians, thinner than a pixel" in each for each in said) is told
 
 
 def test_no_view_is_named_of_volumes_that_were_stopped_of_direct_methods_and_where_all_are_like_the_volume(
@@ -119,7 +119,7 @@ def test_a_volume_of_one_density_is_said_to_show_nothing(
     assert (judgement.figures["residual"] > 0.5) is (wider or not begun)
     said = not_begun_warning(replace(made, volume=volume), judgement)
     assert (said == "") is begun
-    assert begun or ("shows nothing of the sample" in said and "more seconds, steps or iterations" in said)
+    assert begun or ("does not show the sample yet" in said and "more time, steps or iterations" in said)
 
 
 def test_the_differences_that_a_uniform_cylinder_leaves_in_closed_form() -> None:

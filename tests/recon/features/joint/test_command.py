@@ -94,7 +94,7 @@ def test_one_of_the_volumes_is_exported_and_all_are_not(series: Path, tmp_path: 
 def test_a_page_shows_the_times_side_by_side(series: Path, scan: Path, tmp_path: Path) -> None:
     page = series.with_suffix(".html").read_text(encoding="utf-8")
     assert "2 volumes in time" in page and "Slices of each time" in page and "beamline view series.h5" in page
-    assert "Data residual, views used" in page and "data:image/png" in page
+    assert "Residual of the projections used" in page and "data:image/png" in page
     done = beamline("recon", str(scan), *ASKED, "--no-report", "-o", str(tmp_path / "s.h5"))
     assert done.exit_code == 0, done.output
     assert left(tmp_path) == {"s.h5"}
