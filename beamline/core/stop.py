@@ -46,10 +46,12 @@ def stop_signals(stop: StopRequest) -> AbstractContextManager[None]:
     def terminate(number: int, frame: FrameType | None) -> None:
         stop.stop(f"the process received {signal.Signals(number).name}")
         if not stop.aborting:
-            to_stderr(f"Stopping cleanly, as the process received {signal.Signals(number).name}. Ctrl-C aborts.")
+            to_stderr(f"Stopping cleanly, because the process received {signal.Signals(number).name}. Ctrl-C aborts.")
 
     def keep_on(number: int, frame: FrameType | None) -> None:
-        to_stderr("A scan is not suspended, as its shutter would stay open. `beamline pause` pauses it.")
+        to_stderr(
+            "Use `beamline pause` to pause the scan: it cannot be suspended, because the shutter would stay open."
+        )
 
     suspended = {signal.SIGTSTP: keep_on} if hasattr(signal, "SIGTSTP") else {}
     return _caught({signal.SIGINT: interrupt, **suspended, **dict.fromkeys(_ENDING, terminate)})
@@ -64,7 +66,9 @@ class StopOnSignal:
     """
 
     def __init__(
-        self, reply: str = "Stopping as soon as there is a volume. Ctrl-C again discards it.", ready: bool = True
+        self,
+        reply: str = "Stopping as soon as there is a volume. Press Ctrl-C again to stop without a volume.",
+        ready: bool = True,
     ) -> None:
         self._requested, self._reply, self.ready = False, reply, ready
 
@@ -153,7 +157,8 @@ class PauseRequest:
 
     def pause(self, reason: str = "the operator asked for it") -> None:
         self._by_operator = (
-            f"{reason.rstrip('.')}. Enter or `beamline resume` goes on, Ctrl-C or `beamline stop` ends the scan"
+            f"{reason.rstrip('.')}. Press Enter or use `beamline resume` to continue; Ctrl-C or "
+            "`beamline stop` ends the scan"
         )
 
     def resume(self) -> None:

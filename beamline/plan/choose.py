@@ -96,19 +96,19 @@ def choose(
     """
     if target.quality_db is not None and remaining.at_most <= target.quality_db:
         return Choice.ENOUGH, (
-            f"all that the plan still has would add {remaining.mean:.2f} dB ({remaining.low:.2f} to "
-            f"{remaining.high:.2f}); {target.quality_db:g} dB less is accepted"
+            f"the rest of the plan would add {remaining.mean:.2f} dB ({remaining.low:.2f} to {remaining.high:.2f}); a "
+            f"loss of {target.quality_db:g} dB is accepted"
         )
     excesses = {option: _excess(option, target, seconds, dose) for option in offered if option.gain > 0}
     allowed = [option for option, excess in excesses.items() if not excess]
     if not allowed:
-        return Choice.ENOUGH, next(iter(excesses.values()), "nothing that is left would improve the volume")
+        return Choice.ENOUGH, next(iter(excesses.values()), "no choice would improve the volume")
     best = max(allowed, key=lambda option: option.gain / option.seconds)
     following = next((option for option in allowed if option.choice is Choice.NEXT), best)
     taken = following if best.low / best.seconds <= following.high / following.seconds else best
     return taken.choice, (
-        f"{taken.gain:.2f} dB ({taken.low:.2f} to {taken.high:.2f}) in {taken.seconds:.0f} s; "
-        "no other choice is clearly better per second"
+        f"{taken.gain:.2f} dB ({taken.low:.2f} to {taken.high:.2f}) in {taken.seconds:.0f} s; no other choice is "
+        "significantly better per second"
     )
 
 

@@ -288,7 +288,7 @@ def from_text(text: str, *, unknown: bool = False) -> NDArray[np.float64]:
             raise ValueError(f"line {number} holds {word!r}; expected one angle in degrees a line, such as 12.5")
         degrees.append(value)
     if not degrees:
-        raise ValueError("it holds no angle; expected one angle in degrees a line")
+        raise ValueError("it contains no angle; expected one angle in degrees a line")
     return np.deg2rad(np.array(degrees, dtype=np.float64))
 
 

@@ -106,9 +106,9 @@ class FollowedViews:
 
 _FIRST_VIEWS = 12  # fewer views do not determine an axis
 _UNKNOWN = (
-    "These views do not show the rotation axis yet: that of a sample wider than the field is known after half a turn. "
-    "Until then slices are about the middle of the detector, and no volume begins. --axis COLUMN gives the axis now; "
-    "optics.axis_col in the configuration states it in the files of later scans."
+    "If you know the rotation axis, use --axis COLUMN, or optics.axis_col in the configuration of later scans. "
+    "The projections do not show the axis yet, because the sample is wider than the field of view; after 180° it can "
+    "be found. Until then the slices use the middle of the detector as axis, and the volume does not start."
 )
 
 

@@ -228,9 +228,9 @@ def _ended(result: Reconstruction, ending: Ending, chosen: str = "") -> Reconstr
 def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Reconstruction:
     """The volume with the standard deviation of each voxel; if that was stopped, without it and with a warning."""
     if made.ending.early:
-        job.channels.warn("There are no error bars, because the reconstruction was stopped.")
+        job.channels.warn("No error bars were computed, because the reconstruction was stopped.")
         return made
-    job.say("The volume is there; its error bars follow. Ctrl-C leaves them out.", "error_bars")
+    job.say("The volume is done; its error bars are computed next. Press Ctrl-C to leave them out.", "error_bars")
     method = job.options.method_for(job.prepared.geometry)
     method = {each.name: each for each in method.alternatives}.get(made.method, method)
     control = RunControl(job.stop, job.listener(), now=job.channels.clock.now)
@@ -245,7 +245,7 @@ def with_error_bars(job: Job, made: Reconstruction, decided: Decisions) -> Recon
     except ValueError as error:  # hours may be in the volume
         deviation, why = None, str(error)
     if deviation is None:
-        job.channels.warn(f"There are no error bars: {why}. The volume is complete.")
+        job.channels.warn(f"No error bars were computed: {why}. The volume is complete.")
         return made
     factors = method_on_voxels(method, decided.made).error_bars
     assert factors is not None
@@ -295,7 +295,8 @@ def _of_preset(job: Job, result: Reconstruction) -> str:
     asked = method.gaussians
     if isinstance(asked, int) and job.options.checkpoints.resume is None and started_from < asked:
         job.channels.warn(
-            f"The fit started from {started_from} Gaussians, not from {asked}: the sample is too small for more."
+            f"The fit started with {started_from} Gaussians instead of {asked}, because the sample is too small for "
+            "more."
         )
     return ""
 

@@ -178,9 +178,9 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
         fewer = int(needs.rows * memory / needs.at_once)
         rows = f"--rows with {count(fewer, 'row')} or fewer at a time, or " if fewer else ""
         raise ConfigError(
-            f"{count(options.method.volumes, 'volume')} in time of {Grid.matching(needs.geometry).shape} voxels "
-            f"take {size(needs.at_once)} of memory, {size(memory)} may be used. Volumes in time are not made in slabs: "
-            f"give {rows}--bin. Nothing was written."
+            f"{count(options.method.volumes, 'volume')} in time of {Grid.matching(needs.geometry).shape} voxels need "
+            f"{size(needs.at_once)} of memory, but {size(memory)} is allowed. Use {rows}--bin, because volumes in time "
+            "cannot be made in slabs. Nothing was written."
         )
     poses = stated_poses(source, options.selection)
     whole = {
@@ -192,8 +192,8 @@ def refuse_whole(source: ScanSource, options: ReconOptions, needs: ReconMemory, 
     for option, given in whole.items():
         if given:
             raise ConfigError(
-                f"{option} needs the whole scan in memory: {source.path} takes {size(needs.at_once)}, {size(memory)} "
-                f"may be used. Leave it out, or give --bin {2 * options.selection.binning} or --rows."
+                f"{option} needs the whole scan in memory: {source.path} needs {size(needs.at_once)}, but "
+                f"{size(memory)} is allowed. Leave it out, or use --bin {2 * options.selection.binning} or --rows."
             )
 
 
@@ -203,9 +203,9 @@ def refuse_smallest(source: ScanSource, needs: ReconMemory, memory: int, binning
         return
     cheaper = replace(needs, method=Fbp(), weighted=False).least <= memory
     raise DataError(
-        f"{source.path}: {max(needs.parts, key=needs.parts.__getitem__)} takes {size(needs.least)} of memory, "
-        f"{size(memory)} may be used. Give --memory {math.ceil(needs.least / 1e6)}M if there is as much, "
-        f"or --bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
+        f"{source.path}: {max(needs.parts, key=needs.parts.__getitem__)} needs {size(needs.least)} of memory, but "
+        f"{size(memory)} is allowed. Use --memory {math.ceil(needs.least / 1e6)}M if the computer has that much, or "
+        f"--bin {2 * binning}{', or -m fbp' if cheaper else ''}. Nothing was written."
     )
 
 

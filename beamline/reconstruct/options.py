@@ -56,8 +56,8 @@ class OutputPaths:
         """Raise DataError if slabs of an earlier call exist."""
         if os.path.lexists(self.partial):
             raise DataError(
-                f"{self.partial} exists: it has the slabs of an interrupted call. Continue it with --resume "
-                f"{self.partial}, or move it away. Nothing was touched."
+                f"{self.partial} has the finished slabs of an earlier call that was interrupted. Continue with "
+                f"--resume {self.partial}, or move the file away. Nothing was changed."
             )
 
     def refuse_existing(self) -> None:
@@ -83,8 +83,9 @@ class OutputPaths:
         if n_bytes + meanwhile > free:
             work = f" and {size(meanwhile)} while it is made" if meanwhile else ""
             raise DataError(
-                f"The volume takes {size(n_bytes)}{work}, the disk of {self.output} has {size(free)} free. Free some "
-                "space, name an output elsewhere with -o, or give --bin. Nothing was written."
+                f"Not enough disk space: the volume needs {size(n_bytes)}{work}, but the disk of {self.output} has "
+                f"{size(free)} free. Free some space, name an output on another disk with -o, or use --bin. Nothing "
+                "was written."
             )
 
 

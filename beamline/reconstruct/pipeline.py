@@ -162,7 +162,9 @@ def _watch(follower: ScanFollower, clock: Clock, timing: FollowTiming, should_st
             return True
         if should_stop() and not follower.source.finished:
             if not follower.has_volume:
-                raise KeyboardInterrupt("stopped before there were enough views for a volume; nothing was written")
+                raise KeyboardInterrupt(
+                    "stopped before there were enough projections for a volume; nothing was written"
+                )
             return False
         if why := writer.lost(clock.now(), grew, lambda: follower.source.finished):
             raise DataError(
@@ -235,7 +237,7 @@ def _for_method(
         refuse_views(options.method_for(prepared.geometry), prepared.geometry)
     if options.cluster is not None and not plan.slabs:
         channels.warn(
-            "The volume fits into memory and is reconstructed without --cluster; a smaller --memory would make slabs."
+            "--cluster was not used, because the volume fits into memory. With a smaller --memory it is made in slabs."
         )
     if options.method.stops_early and prepared.held_out is None:
         prepared = hold_out(prepared, _HELD_OUT_ONE_IN, advice="leave out --early-stop")

@@ -114,10 +114,9 @@ def fit_within(
     remaining = limit - spent - measuring - after
     if remaining <= 0:
         warn(
-            f"{duration_text(limit)} do not suffice for this scan: reading and correcting it took "
-            f"{duration_text(spent)}, measuring the volume, the report and writing take about "
-            f"{duration_text(measuring + after)}, so nothing is left for the {by_name(method.name).label} method, "
-            "which makes one step."
+            f"{duration_text(limit)} is not enough for this scan: reading and correction took {duration_text(spent)}, "
+            f"and checks, report and writing need about {duration_text(measuring + after)}. Nothing is left for the "
+            f"{by_name(method.name).label} method, which makes only one step."
         )
     before_report = Stop(deadline=started[0] + limit - after, now=clock.now)
     return with_settings(method, {"seconds": max(remaining, 0.0)}), before_report
@@ -139,13 +138,14 @@ def refuse_impossible(options: ReconOptions) -> None:
     """Raise ConfigError before any work if error bars cannot be computed or written."""
     if not all(method.error_bars for method in options.method.alternatives):
         raise ConfigError(
-            f"--uncertainty is calibrated for {', '.join(names_where(lambda each: each.error_bars))}, and not for "
-            f"{options.method.name}: leave it out, or choose another method."
+            f"--uncertainty works only with {', '.join(names_where(lambda each: each.error_bars))}, not with "
+            f"{options.method.name}. Leave it out, or choose another method."
         )
     if options.target.written and options.target.output.suffix.lower() not in SUFFIXES:
         raise ConfigError(
-            f"--uncertainty writes a second volume into the same file: give -o "
-            f"{options.target.output.with_suffix('.h5')}, and export each of the two with --dataset."
+            "--uncertainty writes two volumes into one file, which needs HDF5: use -o "
+            f"{options.target.output.with_suffix('.h5')}. You can then export each of the two with `beamline export "
+            "--dataset`."
         )
 
 
@@ -153,13 +153,13 @@ def refuse_views(method: Method, geometry: Geometry) -> None:
     """Raise ConfigError before any work if these views do not allow error bars."""
     if geometry.n_views < LEAST_VIEWS:
         raise ConfigError(
-            f"--uncertainty splits the views into two halves: at least {LEAST_VIEWS} views are needed, got "
-            f"{geometry.n_views}. Leave it out, or take more views."
+            f"--uncertainty needs at least {LEAST_VIEWS} projections, because it splits them into two halves; there "
+            f"are {geometry.n_views}. Leave it out, or use more projections."
         )
     if isinstance(method, Fit) and method.finish_sweeps == 0:
         raise ConfigError(
-            f"--uncertainty refits on voxels, and {method.name} with --finish 0 has no steps on voxels. Leave one of "
-            "them out."
+            f"--uncertainty needs the voxel refinement of {method.name}, but --finish 0 switches it off. Leave out one "
+            "of the two."
         )
 
 

@@ -66,7 +66,9 @@ def _scene_text(name: str, overrides: Sequence[str]) -> tuple[Path, Mapping[str,
     path = Path(name)
     if not path.is_file():
         if name not in shipped:
-            raise ConfigError(f"There is no file {name}, and {unknown('scene', name, shipped)}. Nothing was simulated.")
+            raise ConfigError(
+                f"The file {name} does not exist, and {unknown('scene', name, shipped)}. Nothing was simulated."
+            )
         path = shipped[name]
     try:
         text = text_in(path, SETTINGS)

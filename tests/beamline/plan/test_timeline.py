@@ -202,7 +202,7 @@ def test_no_violation_means_that_nothing_is_broken(
 
 
 VIOLATIONS = {
-    "period below the camera's": ({"period": 0.0505}, "period_s 0.0505 is below the camera's least 0.051 s"),
+    "period below the camera's": ({"period": 0.0505}, "period_s 0.0505 is below the camera's minimum of 0.051 s"),
     "exposure over period": ({"exposure": 0.2}, "exposure_s 0.2 is longer than period_s 0.1"),
     "speed": (
         {"angles": angles.fixed(40, 90 * DEG)},
@@ -313,9 +313,10 @@ REMARKS = {
     ),
     "whole counts a second": (
         {"angles": angles.fixed(36_000), "period": 0.6},
-        "period_s 0.6 would be 8.33333 counts/s of the stage; it turns at 8, so that views come every 0.625 s",
+        "period_s 0.6 would be 8.33333 counts/s of the stage. The stage turns at 8 counts/s, so there is a projection "
+        "every 0.625 s",
     ),
-    "margin": ({"period": 0.0512}, "less than 1 % over the camera's least 0.051 s"),
+    "margin": ({"period": 0.0512}, "less than 1 % above the camera's minimum of 0.051 s"),
     "few views": ({"angles": angles.fixed(180)}, "180 views are fewer than pi/2 x 252 columns = 396"),
     "no flats": ({"flats": FieldPlan(0, Place.NONE, 0.05)}, "no flats will be taken"),
     "no darks": ({"darks": FieldPlan(5, Place.NONE, 0.05)}, "no darks will be taken"),

@@ -58,7 +58,7 @@ def test_a_fit_gets_the_time_that_reading_measuring_and_writing_leave() -> None:
 def test_too_few_seconds_are_told_before_the_fit_with_what_it_will_take() -> None:
     left, _, said = _within(12.0, spent=9.0)
     assert left == 0
-    assert len(said) == 1 and "12 s do not suffice" in said[0] and "correcting it took 9 s" in said[0]
+    assert len(said) == 1 and "12 s is not enough" in said[0] and "correction took 9 s" in said[0]
 
 
 def _told(

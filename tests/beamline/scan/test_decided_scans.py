@@ -94,7 +94,7 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
         assert [(found.severity, found.message) for found in scan_ended(ScanEvidence(source))] == [("info", run.ended)]
         facts = facts_of(source)
         assert facts.frames == "16/19" and run.ended in facts.remarks and source.attributes["ended"] == run.ended
-    assert run.ended.endswith("1 dB less is accepted. 3 planned frames were not taken.")
+    assert run.ended.endswith("a loss of 1 dB is accepted. 3 planned frames were not taken.")
     assert len(ran.of("recon_done")) == 1  # its volume is waited for
 
 

@@ -156,14 +156,14 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
         (("--volumes", "1"), 2, "--volumes"),
         (("--moves",), 2, "add --volumes N"),
         (("--volumes", "4", "--no-moves"), 5, "12 views or more for each"),
-        (("--volumes", "2", "--memory", "100K"), 2, "may be used. Volumes in time are not made in slabs: give --bin"),
+        (("--volumes", "2", "--memory", "100K"), 2, "because volumes in time cannot be made in slabs: give --bin"),
         (
             ("--volumes", "2", "--memory", "300K"),
             2,
             "made in slabs: give --rows with 1 row or fewer at a time, or --bin",
         ),
         (("--volumes", "4", "--dry-run"), 5, "4 volumes of 36 views: expected 12 views or more for each"),
-        (("--volumes", "2", "--memory", "100K", "--dry-run"), 2, "may be used. Volumes in time are not made in slabs"),
+        (("--volumes", "2", "--memory", "100K", "--dry-run"), 2, "because volumes in time cannot be made in slabs"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(
