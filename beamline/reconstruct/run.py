@@ -138,8 +138,8 @@ def refuse_impossible(options: ReconOptions) -> None:
     """Raise ConfigError before any work if error bars cannot be computed or written."""
     if not all(method.error_bars for method in options.method.alternatives):
         raise ConfigError(
-            f"--uncertainty works only with {', '.join(names_where(lambda each: each.error_bars))}, not with "
-            f"{options.method.name}. Leave it out, or choose another method."
+            f"--uncertainty does not work with {options.method.name}, only with "
+            f"{', '.join(names_where(lambda each: each.error_bars))}. Leave it out, or choose another method."
         )
     if options.target.written and options.target.output.suffix.lower() not in SUFFIXES:
         raise ConfigError(

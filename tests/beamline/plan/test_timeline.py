@@ -213,7 +213,7 @@ VIOLATIONS = {
     "slow": ({"period": 2000.0}, "less than a count a second of the stage; set scan.period_s <= 500"),
     "step beyond": ({"angles": np.array([0.0, 7.0]), "mode": Mode.STEP}, "go from 0° to 401.07°, its limits"),
     "unequal": ({"angles": angles.golden(100)}, "not equally spaced"),
-    "one view": ({"angles": np.zeros(1)}, "at least 2 views"),
+    "one view": ({"angles": np.zeros(1)}, "at least 2 projections"),
     "no flats": ({"flats": FieldPlan(0, Place.START, 0.05)}, "no flats: scan.flats.count is 0"),
     "no darks": ({"darks": FieldPlan(0, Place.BOTH, 0.05)}, "no darks: scan.darks.count is 0"),
     "passes": (
