@@ -168,7 +168,7 @@ def _table_of_options(ended: PassEnded) -> Iterator[str]:
         yield one_line(ended.remark, SENTENCE)
     if ended.wait:
         answer = f"beamline decide CHOICE, Enter for {one_line(ended.recommended)}"
-        yield f"Answer within {ended.wait:.0f} s: {answer}. Otherwise the scan follows its plan."
+        yield f"Within {ended.wait:.0f} s: {answer}; otherwise as planned."
 
 
 def _gain(option: Mapping[str, Any]) -> tuple[str, str]:

@@ -201,7 +201,7 @@ PASS = {"number": 3, "n_views": 270, "options": OPTIONS, "recommended": "next"}
         ({}, ""),
         (
             {"wait": 30.0},
-            "Answer within 30 s: beamline decide CHOICE, Enter for next. Otherwise the scan follows its plan.\n",
+            "Within 30 s: beamline decide CHOICE, Enter for next; otherwise as planned.\n",
         ),
         ({"remark": "No volume yet: \x1b[2J"}, "No volume yet: \\x1b[2J\n"),
     ],

@@ -53,7 +53,7 @@ def test_a_dip_that_stays_becomes_normal() -> None:
 def test_a_sample_that_covers_all_is_said_once_and_dips_are_still_seen() -> None:
     flags = drifting(lambda view: 1.0 if view < 60 else 0.8, 70, depth=lambda view, image: image + 0.5)
     assert [(f.level, f.frame - 10) for f in flags] == [(Level.INFO, 0)] + [(Level.ALARM, i) for i in range(60, 70)]
-    assert "covers all of it" in flags[0].advice
+    assert "covers the whole frame" in flags[0].advice
 
 
 def test_a_sample_that_covers_the_edges_does_not_hide_air_above_it() -> None:

@@ -215,7 +215,7 @@ def test_a_view_of_one_value_was_never_written() -> None:
         counts = image.astype(np.uint16)
         frame = Frame(counts, FrameKind.PROJECTION, 7, 7, 7, 0.0, 0.0, 1.0)
         flag = LostCheck().look(LostState(), frame, digest(counts), dark).flag
-        assert flag is not None and flag.level is Level.ALARM and flag.advice.startswith(said)
+        assert flag is not None and flag.level is Level.ALARM and said in flag.advice
 
 
 def test_it_alone_ends_a_scan() -> None:

@@ -74,7 +74,7 @@ def test_a_sample_that_shrank_is_flagged() -> None:
 def test_a_view_taken_again_shows_a_shift() -> None:
     scan = Moved(190, lambda view: (0, 1.5 * (view > 150)))
     flags = [flag for flag in only(scan) if flag.frame >= 190]
-    assert flags and "taken again" in flags[0].advice and flags[0].frame == 10 + 180
+    assert flags and "at the same angle" in flags[0].advice and flags[0].frame == 10 + 180
     assert flags[0].score == pytest.approx(1.5, abs=0.2)
 
 

@@ -46,9 +46,9 @@ def live(angles: np.ndarray) -> tuple[LiveSlices, Drawn, SteppedClock, Any]:
 @pytest.mark.parametrize(
     ("step", "n", "heading"),
     [
-        (STEP, 63, "FBP of 63 views so far, sequential: 63 of 180 degrees so far, axis at column 7.0"),
-        (STEP, 180, "FBP of 180 views so far, axis at column 7.0"),
-        (GOLDEN, 34, "FBP of 34 views so far, axis at column 7.0"),
+        (STEP, 63, "FBP of the first 63 projections, sequential: 63 of 180 degrees so far, axis at column 7.0"),
+        (STEP, 180, "FBP of the first 180 projections, axis at column 7.0"),
+        (GOLDEN, 34, "FBP of the first 34 projections, axis at column 7.0"),
     ],
 )
 def test_a_heading_says_what_part_of_the_half_turn_is_there(step: float, n: int, heading: str) -> None:

@@ -56,7 +56,7 @@ def odd(said: list[str]) -> str:
 def test_views_with_a_speck_are_named_with_their_frame_and_its_pixels(rng: np.random.Generator) -> None:
     selection = Selection(rows=(FIRST_ROW, FIRST_ROW + 48), binning=2)
     said = odd(warnings_of(*_made(rng, {7: 0.3, 30: -0.5}, "sirt"), selection))
-    assert said.startswith("2 views with a part that is not in the volume")
+    assert "2 projections with a part that is not in the volume" in said
     assert "frame 27, rows" in said and "frame 50, rows" in said and said.count("(absorbs less)") == 1
     worst = said.split("frame 50, rows ")[1].split(" (")[0].replace(", columns", " ...").split(" ... ")
     first, last, left, right = map(int, worst)
@@ -69,7 +69,7 @@ def test_mass_where_views_show_nothing_is_told_and_that_of_a_direct_method_is_no
     method: str, told: bool, rng: np.random.Generator
 ) -> None:
     made, prepared = _made(rng, {}, method)
-    stray = "of the mass of the SIRT volume is stray, where the views show nothing"
+    stray = "of the mass of the SIRT volume lies in voxels that the projections show to be empty"
     assert not any(stray in each for each in warnings_of(made, prepared))
     spoiled = made.volume.data.copy()
     spoiled[:, 2:8, 2:8] += 0.02

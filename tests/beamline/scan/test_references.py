@@ -63,7 +63,7 @@ def test_bad_flats_at_the_end_are_told(tmp_path: Path, monkeypatch: pytest.Monke
     last_view = 16  # after three darks and two flats
     ran = Ran(tmp_path, FakeInstrument(at={last_view: lambda: monkeypatch.setitem(fakes.LEVEL, True, 210)}))
     assert ran.result.reference_faults == tuple(ran.warnings)
-    assert [text[:46] for text in ran.warnings] == ["The flats 17-18: they show no beam. Was the shu"]
+    assert [text[:46] for text in ran.warnings] == ["The flats 17-18: they show no beam. Was the sh"]
 
 
 def test_flats_without_the_light_of_the_views_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
