@@ -38,16 +38,24 @@ def _print_example(ctx: click.Context, param: click.Parameter, value: bool) -> N
               help="Print a configuration to edit.")  # fmt: skip
 @set_option
 @click.option("--check", "only_check", is_flag=True,
-              help="Show what the IOC says, and whether two seconds of frames arrive whole.")  # fmt: skip
-@click.option("--darks", metavar="FILE", help="Darks, where the scan takes none: a scan, HDF5 (FILE::DATASET), TIFF.")
-@click.option("--flats", metavar="FILE", help="Flats, likewise.")
-@click.option("--page", is_flag=True, help="Show the runs in the browser, at one address.")
-@click.option("--no-live", is_flag=True, help="Run without a live reconstruction.")
+              help=("Print the settings of the IOC, and test for two seconds whether all frames arrive. Nothing is "
+                  "recorded."))  # fmt: skip
 @click.option(
-    "--repeat", is_flag=True, help="After a scan, also one that lacks frames, wait for the next one, until Ctrl-C."
+    "--darks", metavar="FILE", help=("File with darks, if the scan takes none: a scan, HDF5 (FILE::DATASET) or TIFF.")
+)
+@click.option(
+    "--flats", metavar="FILE", help=("File with flats, if the scan takes none: a scan, HDF5 (FILE::DATASET) or TIFF.")
+)
+@click.option("--page", is_flag=True, help="Also show the runs in the browser, all at the same address.")
+@click.option("--no-live", is_flag=True, help="Do not reconstruct during the scan.")
+@click.option(
+    "--repeat",
+    is_flag=True,
+    help=("After each scan wait for the next one, even if frames are missing. Ctrl-C ends the command."),
 )
 @click.option("-o", "--output", type=click.Path(path_type=Path, file_okay=False),
-              help="Folder for the folders of runs. Default: storage.folder of CONFIG.")  # fmt: skip
+              help=("Folder in which the folders of the runs are created. Default: storage.folder of "
+                  "CONFIG."))  # fmt: skip
 @json_option
 def ride(
     file: Path,
@@ -58,13 +66,19 @@ def ride(
     as_json: bool,
     **more: object,
 ) -> None:
-    """Record the next scan of another program from its image of areaDetector over PVAccess, as CONFIG says.
+    """Record and reconstruct a scan that another program runs, from EPICS areaDetector.
 
-    Frames go into a run of ours, with the monitor, the page and a live volume, while tomoscan, bluesky or whatever
-    else acquires. No process variable is written, and nothing is slowed down. The first Ctrl-C ends the file in order.
+    \b
+    beamline ride --example > ride.yaml    write a configuration to edit
+    beamline ride ride.yaml --check        test the connection to the IOC
+    beamline ride ride.yaml                record the next scan
 
-    Exit codes: 0 the scan is complete, 2 the configuration or the IOC's settings are wrong, 3 no server, 4 stopped, 5
-    frames are missing (which, and whose loss it was, is said), 7 alarms of the monitor.
+    The other program (tomoscan, bluesky, ...) runs the scan. This command receives the frames of its areaDetector over PVAccess, stores them in
+    a run of its own, checks every frame, shows the page and makes a live volume. It writes no process variable and
+    slows nothing down. The first Ctrl-C closes the file properly.
+
+    Exit codes: 0 the scan is complete, 2 the configuration or the settings of the IOC are wrong, 3 no server, 4
+    stopped, 5 frames are missing (a message lists them and says where they were lost), 7 alarms of the monitor.
     """
     from beamline.config.load import load_as
     from splatline_areadetector.config import RideConfig

@@ -36,19 +36,28 @@ def _prefix(ctx: click.Context, param: click.Parameter, value: str) -> str:
 @click.option("--prefix", default="splatline:", show_default=True, callback=_prefix,
               help="Prefix of the names of the process variables.")  # fmt: skip
 @click.option(
-    "--bind", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Address to listen at; 0.0.0.0: all."
+    "--bind",
+    default="127.0.0.1",
+    show_default=True,
+    metavar="ADDRESS",
+    help="Network address to listen at; 0.0.0.0: all addresses.",
 )
 @click.option("--port", default=None, type=click.IntRange(0, 65535),
-              help="TCP port of the image; by default that of EPICS, or any free one.")  # fmt: skip
+              help="TCP port of the image. Default: the port of EPICS, or any free port.")  # fmt: skip
 @click.option("--files", default=None, type=click.Path(path_type=Path, file_okay=False, exists=True), metavar="FOLDER",
-              help="Write files that clients ask for, below this folder alone.")  # fmt: skip
+              help=("Let clients write files, but only in this folder. Default: clients cannot write "
+                  "files."))  # fmt: skip
 def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | None) -> None:
-    """Publish the frames of the newest run of the folder RUNS (default ./runs) as an EPICS areaDetector does.
+    """Publish the frames of the running scan as an EPICS areaDetector does, for other programs.
 
-    It only reads the run's files, so that it cannot slow a scan down. No client starts, stops or changes the scan.
-    With --files everybody who reaches the address may have frames written below that folder.
+    \b
+    beamline publish
 
-    Exit code: 0 ended by Ctrl-C, 2 p4p or softioc is not installed, 5 the address or port cannot be listened at.
+    Frames of the newest run in the folder RUNS (default ./runs) are published. The command only reads the files of the
+    run, so it cannot slow a scan down. Clients cannot start, stop or change the scan. With --files, everybody who can
+    reach the address can have frames written into that folder.
+
+    Exit code: 0 ended by Ctrl-C, 2 p4p or softioc is not installed, 5 the address or port cannot be used.
     """
     from splatline_areadetector.publish_detector import PublishedDetector, records
     from splatline_areadetector.publish_frames import RunFrames
@@ -60,8 +69,8 @@ def publish(runs: Path, prefix: str, bind: str, port: int | None, files: Path | 
         put = RecordServer(prefix, records(name), bind, detector.asked).put
         with closing(detector), closing(RunFrames(runs, say)) as frames, suppress(KeyboardInterrupt):
             click.echo(
-                f"{name} at {bind}:{image.port}, {prefix}cam1: and {prefix}HDF1: beside it. Ctrl-C ends this, not the "
-                "scan."
+                f"Publishing {name} at {bind}:{image.port}, together with {prefix}cam1: and {prefix}HDF1:. Ctrl-C ends "
+                "this command, not the scan."
             )
             _follow(frames, image, detector, put)
 

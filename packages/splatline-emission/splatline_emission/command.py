@@ -18,22 +18,49 @@ _NEW = click.Path(path_type=Path)
 
 @click.group()
 def emission() -> None:
-    """Simulate or reconstruct the counts of a sample that emits (PET)."""
+    """Simulate or reconstruct emission tomography (PET).
+
+    \b
+    beamline emission simulate -o COUNTS.h5
+    beamline emission recon COUNTS.h5 -o ACTIVITY.h5
+    """
 
 
 @emission.command()
-@click.option("-o", "--output", metavar="FILE.h5", type=_NEW, required=True, help="Counts, as `recon` reads them.")
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE.h5",
+    type=_NEW,
+    required=True,
+    help="File for the counts; `beamline emission recon` reads it.",
+)
 @click.option("--truth", metavar="FILE", callback=parsed(lambda text: text and volume_path(text)),
-              help="Write the activity behind them, too.")  # fmt: skip
-@click.option("--views", type=click.IntRange(2, 100_000), default=120, show_default=True, help="Over half a turn.")
-@click.option("--shape", type=click.IntRange(1), nargs=2, default=(16, 64), show_default=True, help="Rows, columns.")
-@click.option("--trues", type=click.FloatRange(1), default=1.5e7, show_default=True, help="Counts without scatter.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of all random numbers.")
+              help="Also write the true activity to this file.")  # fmt: skip
+@click.option(
+    "--views", type=click.IntRange(2, 100_000), default=120, show_default=True, help="Number of projections over 180°."
+)
+@click.option(
+    "--shape",
+    type=click.IntRange(1),
+    nargs=2,
+    default=(16, 64),
+    show_default=True,
+    help="Rows and columns of the detector.",
+)
+@click.option(
+    "--trues", type=click.FloatRange(1), default=1.5e7, show_default=True, help="Number of counts without scatter."
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of all random numbers.")
 @json_option
 def simulate(
     output: Path, truth: Path | None, views: int, shape: tuple[int, int], trues: float, seed: int, as_json: bool
 ) -> None:
-    """Simulate counts of hot and cold rods in water (after NEMA NU 4-2008), in lines of 1 mm."""
+    """Simulate the counts of hot and cold rods in water (after NEMA NU 4-2008), with lines of response of 1 mm.
+
+    \b
+    beamline emission simulate -o COUNTS.h5
+    """
     import numpy as np
 
     from beamline.core.quantities import VoxelKind
@@ -62,17 +89,32 @@ def simulate(
 @emission.command()
 @click.argument("file", type=_NEW)
 @click.option("-o", "--output", metavar="PATH", callback=parsed(volume_path), required=True,
-              help="The activity; the suffix chooses the format.")  # fmt: skip
+              help="File for the activity; its suffix sets the format.")  # fmt: skip
 @click.option("-m", "--method", default="osem", show_default=True,
-              help="mlem, osem, or any other method, by lines that carry the likelihood to second order.")  # fmt: skip
-@click.option("--iterations", type=click.IntRange(1), help="Of mlem and osem. Default: as counts held out prefer.")
-@click.option("--subsets", type=click.IntRange(1), default=4, show_default=True, help="Of the views, for osem.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of all random numbers.")
+              help=("mlem, osem, or any method of `beamline recon`, with weights that approximate the likelihood to "
+                  "second order."))  # fmt: skip
+@click.option(
+    "--iterations",
+    type=click.IntRange(1),
+    help=("Number of iterations of mlem and osem. Default: chosen with held-out counts."),
+)
+@click.option(
+    "--subsets",
+    type=click.IntRange(1),
+    default=4,
+    show_default=True,
+    help="Number of subsets of the projections, for osem.",
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of all random numbers.")
 @json_option
 def recon(
     file: Path, output: Path, method: str, iterations: int | None, subsets: int, seed: int, as_json: bool
 ) -> None:
-    """Reconstruct the activity behind the counts of FILE, in counts per mm of line."""
+    """Reconstruct the activity from the counts in FILE, in counts per mm of line of response.
+
+    \b
+    beamline emission recon COUNTS.h5 -o ACTIVITY.h5
+    """
     import numpy as np
 
     import recon as reconstruction

@@ -48,14 +48,14 @@ def angles_of(text: str) -> NDArray[np.float64]:
     except (ValueError, ZeroDivisionError):
         angles = np.empty(0)
     if not angles.size or not np.isfinite(angles).all():
-        raise ValueError(f"{text!r} names no angles; expected FIRST:END:STEP or A,B,... in degrees")
+        raise ValueError(f"{text!r} is not a list of angles; expected FIRST:END:STEP or A,B,... in degrees")
     return np.radians(angles)
 
 
 @contextmanager
 def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, Answer]]:
     """The model behind `volume`, for a new file at `output`."""
-    from beamline.gaussians import read_model  # here: help needs none of it
+    from beamline.gaussians import read_model  # imported here because help does not need it
 
     with answering(as_json) as answer:
         refuse_existing(output)
@@ -65,16 +65,20 @@ def _making(volume: Path, output: Path, as_json: bool) -> Iterator[tuple[Model, 
 @click.command()
 @volume_argument
 @click.option("-o", "--output", metavar="PATH", callback=parsed(volume_path), required=True,
-              help="Output; the suffix chooses the format.")  # fmt: skip
+              help="File to write; its suffix sets the format.")  # fmt: skip
 @click.option("--voxel", type=click.FloatRange(min=0, min_open=True),
-              help="Edge of a voxel, in the unit of the volume. Default: that of VOLUME.")  # fmt: skip
+              help=("Voxel size, in the unit of the volume. Default: the voxel size of VOLUME."))  # fmt: skip
 @click.option("--box", metavar="Z0:Z1,Y0:Y1,X0:X1", callback=parsed(box_of),
-              help="Box to fill, in the unit of the volume, from the axis. Default: that of VOLUME.")  # fmt: skip
+              help=("Box to compute, in the unit of the volume, measured from the rotation axis. Default: the box of "
+                  "VOLUME."))  # fmt: skip
 @json_option
 def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, as_json: bool) -> None:
-    """Fill voxels of any size and box from the Gaussians behind a volume.
+    """Compute a volume with other voxels, or of another box, from the Gaussians of an r2 volume.
 
-    These are the fit's, before its finish on voxels.
+    \b
+    beamline voxelise VOLUME.h5 -o FINE.h5 --voxel 0.001
+
+    The Gaussians are those of the fit, without the voxel refinement (--finish) that followed it.
     """
     from beamline.storage.volumes.files import write_volume
     from splatline_models.made import box_grid, voxelised
@@ -92,16 +96,25 @@ def voxelise(volume: Path, output: Path, voxel: float | None, box: Box | None, a
 
 @click.command()
 @volume_argument
-@click.option("-o", "--output", metavar="PATH.h5", type=_NEW, required=True, help="New file.")
+@click.option("-o", "--output", metavar="PATH.h5", type=_NEW, required=True, help="New HDF5 file.")
 @click.option("--angles", metavar="FIRST:END:STEP|A,B,...", callback=parsed(angles_of),
-              help="Of the views, in degrees; END is not one of them. Default: those that were fitted.")  # fmt: skip
+              help=("Angles of the projections in degrees; END is not included. Default: the angles of the "
+                  "scan."))  # fmt: skip
 @json_option
 def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_json: bool) -> None:
-    """Project the Gaussians behind a volume: line integrals of views at any angle, as a scan in Data Exchange."""
+    """Compute projections at any angle from the Gaussians of an r2 volume.
+
+    \b
+    beamline render VOLUME.h5 -o VIEWS.h5 --angles 0:180:0.5
+
+    The file is a scan in Data Exchange format; its pixels are line integrals.
+    """
     from splatline_models.made import write_views
 
     if output.suffix.lower() not in (".h5", ".hdf5"):
-        raise click.UsageError(f"-o {output}: views are HDF5; give a name such as {output.with_suffix('.h5')}.")
+        raise click.UsageError(
+            f"-o {output}: projections are written to HDF5. Use a name such as {output.with_suffix('.h5')}."
+        )
     with _making(volume, output, as_json) as (model, answer):
         views = model.geometry.angles if angles is None else angles
         write_views(output, model, views, answer.counting("views"))
@@ -111,13 +124,19 @@ def render(volume: Path, output: Path, angles: NDArray[np.float64] | None, as_js
 @click.command()
 @volume_argument
 @click.option("-o", "--output", metavar="PATH", type=_NEW, required=True,
-              help=f"Its suffix names the format: {', '.join(_MESHES)}.")  # fmt: skip
-@click.option("--level", type=float, help="Value at the surface. Default: half-way between air and matter.")
+              help=f"File to write; its suffix sets the format: {', '.join(_MESHES)}.")  # fmt: skip
+@click.option(
+    "--level", type=float, help=("Value of the voxels at the surface. Default: half-way between air and sample.")
+)
 @json_option
 def surface(volume: Path, output: Path, level: float | None, as_json: bool) -> None:
-    """Write the surface of a volume as a watertight mesh, in its unit of length (mm if the voxel size is known).
+    """Write the surface of the sample as a watertight mesh, for example for 3D printing.
 
-    Matter that leaves the volume is closed at its faces. Finer: of `beamline voxelise` with smaller voxels.
+    \b
+    beamline surface VOLUME.h5 -o MESH.stl
+
+    Lengths are in the unit of the volume (mm if the voxel size is known). If the sample extends beyond the volume, the
+    mesh is closed at the faces of the volume. For a finer mesh, first use `beamline voxelise` with smaller voxels.
     """
     import meshio  # type: ignore[import-untyped]
 

@@ -85,9 +85,9 @@ def test_views_of_a_model_of_displaced_views_are_in_their_place(folder: Path) ->
 REFUSED = [
     (("voxelise", "f.h5", "-o", "x.h5"), 5, "holds no Gaussians"),
     (("render", "f.h5", "-o", "x.h5"), 5, "holds no Gaussians"),
-    (("render", "f.h5", "-o", "x.tif"), 2, "views are HDF5"),
-    (("render", "f.h5", "-o", "x.h5", "--angles", "0:180:0"), 2, "names no angles"),
-    (("render", "f.h5", "-o", "x.h5", "--angles", "nan"), 2, "names no angles"),
+    (("render", "f.h5", "-o", "x.tif"), 2, "projections are written to HDF5"),
+    (("render", "f.h5", "-o", "x.h5", "--angles", "0:180:0"), 2, "is not a list of angles"),
+    (("render", "f.h5", "-o", "x.h5", "--angles", "nan"), 2, "is not a list of angles"),
     (("voxelise", "f.h5", "-o", "x.h5", "--box", "0:1,0:1"), 2, "is not a box"),
 ]
 

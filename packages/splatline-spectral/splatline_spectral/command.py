@@ -43,31 +43,51 @@ def charges_of(ctx: click.Context, param: click.Parameter, value: str | None) ->
 
 @click.command()
 @click.argument("sources", metavar="SCENE|FILE...", nargs=-1, required=True)
-@click.option("--from", "low", type=_KEV, metavar="KEV", help="First energy; a scene needs it.")
-@click.option("--to", "high", type=_KEV, metavar="KEV", help="Last energy; a scene needs it.")
-@click.option("--step", type=_KEV, default=0.001, show_default=True, metavar="KEV", help="Between a scene's energies.")
-@click.option("--material", metavar="NAME", help="Material of the scene. Default: the one with a state of charge.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of a scene's random numbers.")
+@click.option("--from", "low", type=_KEV, metavar="KEV", help="First energy in keV; required for a scene.")
+@click.option("--to", "high", type=_KEV, metavar="KEV", help="Last energy in keV; required for a scene.")
+@click.option(
+    "--step",
+    type=_KEV,
+    default=0.001,
+    show_default=True,
+    metavar="KEV",
+    help="Step between the energies of a scene, in keV.",
+)
+@click.option(
+    "--material",
+    metavar="NAME",
+    help=("Material of the scene to evaluate. Default: the material with a state of charge."),
+)
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the random numbers of a scene."
+)
 @click.option("--states", "charges", metavar="CHARGE,...", callback=charges_of,
-              help="States of charge, 0 to 1, that the scene's material has, one after the other.")  # fmt: skip
+              help=("States of charge (0 to 1) of the material of the scene, each simulated in turn."))  # fmt: skip
 @click.option("--region", "regions", multiple=True, callback=lambda ctx, param, values: tuple(map(box, values)),
-              metavar=_BOX, help="The material in a file's frames; all of them unless given.")  # fmt: skip
+              metavar=_BOX, help=("Region of the frames that shows the material. Default: the whole "
+                  "frame."))  # fmt: skip
 @click.option("--around", callback=lambda ctx, param, value: None if value is None else box(value), metavar=_BOX,
-              help="Region around the material, for the contrast. Default: none.")  # fmt: skip
+              help=("Region next to the material, for the contrast. Default: no contrast is computed."))  # fmt: skip
 @click.option("--unit", type=click.Choice(["keV", "eV"]),
-              help="Unit of a file's energies. Default: as in the file, else keV.")  # fmt: skip
+              help=("Unit of the energies in a file. Default: the unit that the file states, otherwise "
+                  "keV."))  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path, dir_okay=False),
-              help="Picture (.png), with the table beside it (.csv). Default: SOURCE_xafs.png.")  # fmt: skip
+              help=("Picture to write (.png); the table is written next to it (.csv). Default: "
+                  "SOURCE_xafs.png."))  # fmt: skip
 @json_option
 def xafs(sources: Sequence[str], output: Path | None, as_json: bool, **values: Any) -> None:
-    """Find a material's absorption edge and the energy of its highest contrast.
+    """Find the absorption edge of a material and the photon energy with the highest contrast.
 
-    SCENE is a YAML file or the name of a scene that comes with the package: its radiographs are simulated at all
-    energies from --from to --to. FILE is a text table of energy and absorption, an HDF5 file with `energy` and
-    either `mu` or `frames` and `flats`, or the folder of a series of scans (`scan.energies`). Several FILEs, --region
-    or --states come into one picture with the edge of each.
+    \b
+    beamline xafs edge_scan --from 8.30 --to 8.42    simulate a scene
+    beamline xafs SPECTRUM.txt                       evaluate a measurement
 
-    Exit code 6: no edge was found; picture and table are written, too.
+    SCENE is a YAML file or the name of a scene that comes with the package. Its radiographs are simulated at all
+    energies from --from to --to. FILE is a text table of energy and absorption, an HDF5 file with `energy` and either
+    `mu` or `frames` and `flats`, or the folder of a series of scans (`scan.energies`). Several FILEs, --region or
+    --states are drawn in one picture, each with its edge.
+
+    Exit code 6: no edge was found; picture and table are written nevertheless.
     """
     from splatline_spectral.results import lines, write_results
     from splatline_spectral.sources import Jobs, results_of

@@ -62,7 +62,7 @@ def read_spectra(path: Path) -> Spectra:
         values = np.array([[float(cell) for _, cell in zip(head, line, strict=True)] for line in rest])
         values = values[np.argsort(values[:, 0])]
     except (OSError, csv.Error, ValueError, IndexError) as error:
-        raise DataError(f"{path} is no table of spectra ({error}). Expected {_TABLE}.") from error
+        raise DataError(f"{path} is not a table of spectra ({error}). Expected {_TABLE}.") from error
     if head[0].strip() != "energy_kev" or not names or len({name.casefold() for name in names}) < len(names):
         raise DataError(f"{path} begins {','.join(head)[:80]!r}. Expected {_TABLE}, with names that differ.")
     if not np.isfinite(values).all() or (np.diff(values[:, 0]) == 0).any() or (values < 0).any():
@@ -75,23 +75,43 @@ def read_spectra(path: Path) -> Spectra:
 @click.command()
 @click.argument("files", metavar="SCAN...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--spectra", type=_FILE, required=True,
-              help="CSV table: energy_kev and names of materials in the first line, then keV and 1/mm.")  # fmt: skip
+              help=("CSV table of the attenuation. First line: energy_kev and the names of the materials. Then one "
+                  "line per energy, in keV and 1/mm."))  # fmt: skip
 @click.option("-o", "--output", metavar="PATH.h5", type=_FILE, required=True,
-              help="One file per material, with _NAME appended to this stem.")  # fmt: skip
+              help=("Name for the results. One file is written per material, with _NAME added before the "
+                  "suffix."))  # fmt: skip
 @click.option("--register", is_flag=True,
-              help="Find and correct the sample position and the magnification of each scan.")  # fmt: skip
+              help=("Find and correct changes of sample position and magnification between the scans."))  # fmt: skip
 @click.option("--states", metavar="NAME,NAME",
-              help="Two materials that are two states of the same one: the share of the second is smooth.")  # fmt: skip
-@click.option("--axis", type=float, metavar="COL", help="Rotation axis. Default: that of the first scan.")
-@click.option("--rows", type=click.IntRange(0), nargs=2, metavar="FIRST END", help="Rows of the detector to use.")
-@click.option("--bin", "binning", type=click.IntRange(1), default=1, show_default=True, help="Pixels joined each way.")
+              help=("Two materials that are two states of the same material: the fraction of the second one is kept "
+                  "smooth."))  # fmt: skip
+@click.option(
+    "--axis",
+    type=float,
+    metavar="COL",
+    help=("Rotation axis: column of the detector. Default: the axis of the first scan."),
+)
+@click.option(
+    "--rows",
+    type=click.IntRange(0),
+    nargs=2,
+    metavar="FIRST END",
+    help=("Detector rows to use, from FIRST up to, not including, END. Default: all."),
+)
+@click.option(
+    "--bin", "binning", type=click.IntRange(1), default=1, show_default=True, help="Average blocks of N x N pixels."
+)
 @json_option
 def materials(files: tuple[Path, ...], spectra: Path, output: Path, as_json: bool, **values: Any) -> None:
-    """Fit the volume of each material to scans at several energies, all at once.
+    """Reconstruct one volume per material from scans at several energies, all at once.
 
-    Each SCAN states its energy; the folder of a series (`scan.energies`) stands for its scans. Few views an energy are
-    enough: all views together determine the materials. Views of different energies should have different angles. The
-    sample must not move between the scans, nor its magnification change, or --register finds how.
+    \b
+    beamline materials E1.h5 E2.h5 E3.h5 --spectra MU.csv -o M.h5
+
+    Each SCAN states its energy; instead of scans you can give the folder of a series (`scan.energies`). A few
+    projections per energy are enough, because all projections together determine the materials. Projections of
+    different energies should have different angles. If the sample moved or its magnification changed between the
+    scans, use --register.
     """
     import recon
     from beamline.api import Selection

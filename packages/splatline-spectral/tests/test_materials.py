@@ -130,7 +130,7 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
         ([*scans, "--spectra", narrow], "expected 8.34 to 8.36 keV"),
         ([scans[0], "--spectra", spectra(tmp_path)], "cannot distinguish 2 materials"),
         ([*scans, "--spectra", wrong], "begins 'kev,fresh'"),
-        ([*scans, "--spectra", tmp_path / "absent.csv"], "no table of spectra"),
+        ([*scans, "--spectra", tmp_path / "absent.csv"], "not a table of spectra"),
     ):
         done = beamline("materials", *words, "-o", tmp_path / "out.h5", "--axis", "31.5")
         assert done.exit_code in (2, 5) and said in done.output, done.output
@@ -142,9 +142,9 @@ def test_what_does_not_fit_leaves_nothing(scans: list[Path], tmp_path: Path) -> 
     [
         ("energy_kev,a,A\n8.3,1,2\n8.4,2,1\n", "names that differ"),
         ('energy_kev,"a\nb"\n8.3,1\n8.4,2\n', "parts of file names"),
-        ("energy_kev,a,b\n8.3,1,2\n8.4,1\n", "no table of spectra"),
+        ("energy_kev,a,b\n8.3,1,2\n8.4,1\n", "not a table of spectra"),
         ("energy_kev,a\n8.3,1\n8.3,2\n", "energies must differ"),
-        ("\n", "no table of spectra"),
+        ("\n", "not a table of spectra"),
     ],
 )
 def test_a_table_that_is_none_is_refused(tmp_path: Path, table: str, said: str) -> None:

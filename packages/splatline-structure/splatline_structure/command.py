@@ -62,91 +62,140 @@ class Seen:
 
 @click.command(cls=Repeatable)
 @click.argument("volumes", metavar="VOLUME...", nargs=-1, required=True, type=_FILE)
-@click.option("--compare", is_flag=True, help="Two volumes, such as charged and discharged: what changed.")
-@click.option("--dataset", metavar="PATH", help="Array in an HDF5 file or .npz. Default: that of a reconstruction.")
+@click.option(
+    "--compare",
+    is_flag=True,
+    help=("Compare two volumes, for example charged and discharged, and report what changed."),
+)
+@click.option(
+    "--dataset",
+    metavar="PATH",
+    help=("Name of the array in an HDF5 or .npz file. Default: the volume of a reconstruction."),
+)
 @click.option("--voxel-um", metavar="EDGE|Z:Y:X", callback=parsed(edges_of),
-              help="Edge of a voxel, or its three. Default: the file's.")  # fmt: skip
-@click.option("--materials", type=click.IntRange(2, 6), help="Number of materials. Default: that of labels, or 2.")
+              help=("Voxel size in µm: one value, or three (Z:Y:X). Default: the value in the file."))  # fmt: skip
+@click.option(
+    "--materials",
+    type=click.IntRange(2, 6),
+    help=("Number of materials in the volume. Default: the number of labels if VOLUME has labels, otherwise 2."),
+)
 @click.option(
     "--particles",
     type=click.IntRange(1),
-    help="Material of the particles, from 1, the least dense. Default: the densest.",
+    help=("Number of the material that forms the particles (1: the least dense). Default: the densest material."),
 )
 @click.option(
     "--through",
     type=click.IntRange(1),
     default=1,
     show_default=True,
-    help="Material whose connected share and tortuosity are taken.",
+    help=("Number of the material for connected fraction and tortuosity (1: the least dense, usually the pores)."),
 )
 @click.option(
     "--parts",
     metavar="A B",
     type=_FILE,
     nargs=2,
-    help="The volume from every other view, and from the others: all slices, or only those that are measured.",
+    help=(
+        "Two volumes reconstructed from every other projection and from the remaining ones, for the interval: all "
+        "slices, or only those that are measured. Default: they are reconstructed now."
+    ),
 )
 @click.option(
     "--scan",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="Scan of the volume, from whose halves it is made again. Default: the one that the volume names.",
+    help=("Scan from whose two halves the volume is reconstructed again. Default: the scan that the volume names."),
 )
-@click.option("--quick", is_flag=True, help="Leave out what the views do to the numbers.")
+@click.option(
+    "--quick",
+    is_flag=True,
+    help=("Do not reconstruct again: the intervals do not include the error from the projections."),
+)
 @click.option("--crop", type=click.Choice(["square", "finite", "none"]), default="square", show_default=True,
-              help="square: inside the circle of the sample, or of the field, without a can's wall. finite: inside the "
-                   "circle beyond which voxels are not finite.")  # fmt: skip
+              help="Part of each slice that is measured. square: the square inside the circle of the sample, or of the "
+                  "field of view, without the wall of a can. finite: inside the circle beyond which voxels are not "
+                  "finite. none: the whole slice.")  # fmt: skip
 @click.option("--memory", metavar="SIZE", callback=parsed(memory_size),
-              help="For volumes, such as 8G. Of a larger one the slices in the middle that fit are looked at, and all "
-                   "for fractions and surface; several volumes are measured whole. Default: what is free.")  # fmt: skip
-@click.option("--slices", type=click.IntRange(0), nargs=2, metavar="FIRST END", help="Slices to take. Default: all.")
+              help="Memory for volumes, for example 8G. From a larger volume only the middle slices that fit are used, "
+                  "except for fractions and surface, which use all slices. If you give several volumes, all slices are "
+                  "used. Default: the free memory.")  # fmt: skip
+@click.option(
+    "--slices",
+    type=click.IntRange(0),
+    nargs=2,
+    metavar="FIRST END",
+    help=("Slices to measure, from FIRST up to, not including, END. Default: all."),
+)
 @click.option(
     "--radius",
     type=click.IntRange(0, 20),
     default=1,
     show_default=True,
-    help="Radius of opening and closing particles, voxels.",
+    help=("Radius in voxels of the opening and closing by which particles are cleaned."),
 )
 @click.option(
-    "--smallest", type=click.IntRange(0), default=27, show_default=True, help="Voxels of the smallest particle."
+    "--smallest",
+    type=click.IntRange(0),
+    default=27,
+    show_default=True,
+    help="Size of the smallest particle in voxels; smaller ones are dropped.",
 )
 @click.option(
     "--neck",
     type=click.FloatRange(min=0),
     default=0.8,
     show_default=True,
-    help="Parts that touch are one particle where the neck is this share of the narrower part, or wider; 0: always.",
+    help=(
+        "Touching parts count as one particle if the neck between them is at least this fraction of the width of the "
+        "narrower part. 0: always."
+    ),
 )
 @click.option(
     "--side",
     type=click.IntRange(0),
     default=96,
     show_default=True,
-    help="Voxels of the central cube of the tortuosity; 0: none.",
+    help=("Side in voxels of the central cube for the tortuosity. 0: no tortuosity."),
 )
 @click.option(
-    "--labels", type=click.Choice(["h5", "tif", "zarr"]), default="h5", show_default=True, help="Format of the labels."
+    "--labels",
+    type=click.Choice(["h5", "tif", "zarr"]),
+    default="h5",
+    show_default=True,
+    help="File format of the labels.",
 )
-@click.option("-o", "--output", type=_FILE, help="New folder. Default: VOLUME's stem + _structure, here.")
+@click.option(
+    "-o",
+    "--output",
+    type=_FILE,
+    help=("New folder for the results. Default: the name of VOLUME with _structure, in the current folder."),
+)
 @json_option
 def structure(volumes: tuple[Path, ...], compare: bool, output: Path | None, as_json: bool, **values: Any) -> None:
-    """Measure the microstructure of VOLUME: fractions of materials, particles, surface, contacts, cracks, connected
-    share and tortuosity, each with an interval of 80 %.
+    """Measure the microstructure of a volume: fractions, particles, surface, cracks, tortuosity.
 
-    The interval has four causes: the views (the volume is made again from each half of them), the levels of the
-    materials, the size of a voxel, and the number of particles. Where it is wider than half of the value, the number is
-    given as not determined.
+    \b
+    beamline structure VOLUME.h5
+    beamline structure CHARGED.h5 DISCHARGED.h5 --compare
 
-    Several volumes are a series in time. The new folder gets report.html, numbers.csv, structure.json, particles.csv
-    and labels.
+    The results are the volume fractions of the materials, particles, surface area, contacts, cracks, the connected
+    fraction and the tortuosity. Each number has an interval that contains the true value with 80 % probability.
+
+    The interval includes four causes of error: the projections (the volume is reconstructed again from each half of
+    them), the grey levels of the materials, the voxel size, and the number of particles. If the interval is wider than
+    half of the value, the number is reported as not determined.
+
+    Several volumes are treated as a time series. A new folder is written, with report.html, numbers.csv,
+    structure.json, particles.csv and the labels.
     """
     from beamline.core.machine import free_memory
     from beamline.storage.interrupted import volume_file
     from splatline_structure.volumes import read_volume
 
     if compare and len(volumes) != 2:
-        raise click.UsageError(f"--compare takes two volumes, got {len(volumes)}.")
+        raise click.UsageError(f"--compare needs two volumes, got {len(volumes)}.")
     if values["parts"] and (len(volumes) > 1 or values["scan"]):
-        raise click.UsageError("--parts are of one volume, without --scan.")
+        raise click.UsageError("--parts works only with one volume and without --scan.")
     paths = [volume_file(path) for path in volumes]
     output = output or Path(f"{safe_name(paths[0].name.split('.')[0])}_structure")
     with answering(as_json) as answer:

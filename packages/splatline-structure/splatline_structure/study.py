@@ -21,7 +21,7 @@ def numbers_of_views(text: str) -> list[int]:
     parts = text.split(",")
     if not all(part.strip().isdecimal() and int(part) >= FEWEST_VIEWS for part in parts):
         raise ValueError(
-            f"{text!r}: expected numbers such as 45,90,180, of {FEWEST_VIEWS} views or more, as both halves are "
+            f"{text!r}: expected numbers such as 45,90,180, each at least {FEWEST_VIEWS}, because both halves are "
             "reconstructed"
         )
     return list(dict.fromkeys(map(int, parts)))
@@ -29,12 +29,26 @@ def numbers_of_views(text: str) -> list[int]:
 
 @click.command("study structure")
 @click.argument("scan", metavar="SCAN|RUN", type=click.Path(path_type=Path), callback=as_scan)
-@click.option("--views", metavar="N,N,...", required=True, callback=parsed(numbers_of_views), help="Numbers of views.")
+@click.option(
+    "--views",
+    metavar="N,N,...",
+    required=True,
+    callback=parsed(numbers_of_views),
+    help="Numbers of projections to try.",
+)
 @click.option("--number", "names", multiple=True, default=("fraction_2", "size_50", "surface", "tortuosity_z"),
-              show_default=True, help="Number to follow, or all of a kind (tortuosity); may be repeated.")  # fmt: skip
-@click.option("-m", "--method", default="fista-tv", show_default=True, help="Of the reconstructions.")
-@click.option("--materials", type=click.IntRange(2, 6), default=2, show_default=True, help="Number of materials.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="New folder. Default: SCAN's stem + _views.")
+              show_default=True, help=("Number to plot, or a kind of numbers (tortuosity). Can be given several "
+                  "times."))  # fmt: skip
+@click.option("-m", "--method", default="fista-tv", show_default=True, help="Method of the reconstructions.")
+@click.option(
+    "--materials", type=click.IntRange(2, 6), default=2, show_default=True, help="Number of materials in the sample."
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    help=("New folder for the results. Default: the name of SCAN with _views, in the current folder."),
+)
 @json_option
 def study_structure(
     scan: Path,
@@ -45,9 +59,14 @@ def study_structure(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Show what fewer views of SCAN cost in numbers of its microstructure: each with its interval, against views.
+    """Show how accurate the numbers of `beamline structure` are with fewer projections.
 
-    Before a beamtime, SCAN is one of `beamline simulate`: so it says how many views a wanted interval takes.
+    \b
+    beamline simulate cathode -o SCAN.h5
+    beamline study structure SCAN.h5 --views 45,90,180
+
+    The scan is reconstructed from each number of projections, and the numbers of its microstructure are plotted with
+    their intervals. With a simulated scan you can find out before a beamtime how many projections you need.
     """
     import numpy as np
 

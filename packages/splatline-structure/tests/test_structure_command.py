@@ -265,8 +265,8 @@ REFUSED = [
     (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "(`recon --roi`, then --parts or --quick)"),
     (("can.npy", *VOXEL_UM, "--scan", "nosuch.h5"), 2, "'nosuch.h5' does not exist"),
     (("can.npy", *VOXEL_UM, "--particles", "3"), 2, "Material 3 of 2"),
-    (("can.npy", *VOXEL_UM, "--compare"), 2, "--compare takes two volumes"),
-    (("can.npy", "can.npy", *VOXEL_UM, "--parts", "can.npy", "can.npy"), 2, "--parts are of one volume"),
+    (("can.npy", *VOXEL_UM, "--compare"), 2, "--compare needs two volumes"),
+    (("can.npy", "can.npy", *VOXEL_UM, "--parts", "can.npy", "can.npy"), 2, "--parts works only with one volume"),
     (
         ("can.npy", *VOXEL_UM, "--parts", "small.npy", "small.npy"),
         5,
