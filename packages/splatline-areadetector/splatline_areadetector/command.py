@@ -73,9 +73,9 @@ def ride(
     beamline ride ride.yaml --check        test the connection to the IOC
     beamline ride ride.yaml                record the next scan
 
-    The other program (tomoscan, bluesky, ...) runs the scan. This command receives the frames of its areaDetector over PVAccess, stores them in
-    a run of its own, checks every frame, shows the page and makes a live volume. It writes no process variable and
-    slows nothing down. The first Ctrl-C closes the file properly.
+    The other program (tomoscan, bluesky, ...) runs the scan. This command receives the frames of its areaDetector over
+    PVAccess, stores them in a run of its own, checks every frame, shows the page and makes a live volume. It writes no
+    process variable and slows nothing down. The first Ctrl-C closes the file properly.
 
     Exit codes: 0 the scan is complete, 2 the configuration or the settings of the IOC are wrong, 3 no server, 4
     stopped, 5 frames are missing (a message lists them and says where they were lost), 7 alarms of the monitor.
