@@ -104,7 +104,7 @@ def test_the_last_round_can_be_ended_early_with_what_there_is(tmp_path: Path) ->
     ("seconds", "told"),
     others_slow(
         [
-            (3.0, "Stopped while the scan was running: the volume shows the first {} views."),
+            (3.0, "Stopped during the scan: the volume is reconstructed from the first {} projections."),
             (1.5, ""),  # seven views
             (np.inf, "Stopped: the volume is reconstructed from the first {} of 30 views."),
         ]
@@ -180,7 +180,7 @@ SO_FAR = {"recon.snapshot.h5", "recon.live.png"}
     ("frames", "status", "said", "left"),
     [
         ([], None, "No scan began in .* within 3 s", set()),
-        (FRAMES[:16], None, "has lost its writer and is not finished.*`beamline recover .*12 views", SO_FAR),
+        (FRAMES[:16], None, "has lost its writer and is not finished.*`beamline recover .*12 projections", SO_FAR),
         (FRAMES[:4], "stopped", "0 projections", set()),
         (FRAMES[:5], "stopped", "1 projections", set()),
         ([f for f in FRAMES if f.kind != 1], "complete", "without flats", set()),

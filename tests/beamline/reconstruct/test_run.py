@@ -85,9 +85,9 @@ def test_a_call_with_too_few_seconds_says_so_before_the_fit_and_leaves_out_what_
     events, phases = _told(tmp_path, R2(seconds=2.0, gaussians=50), SteppedClock(tick=0.1))
     said = [str(event.data.get("message", "")) for event in events]
     fit = next(n for n, event in enumerate(events) if event.data.get("stage") == "recon")
-    assert any("2 s do not suffice" in text for text in said[:fit])
+    assert any("2 s is not enough" in text for text in said[:fit])
     assert "FBP for comparison" not in phases and "fbp" not in events[-1].data
-    remark = next(text for text in said[fit:] if text.startswith("Left out, as the seconds"))
+    remark = next(text for text in said[fit:] if text.startswith("These checks were left out, because the time limit"))
     assert remark in (tmp_path / "out.html").read_text()
 
 

@@ -169,7 +169,7 @@ def test_a_dry_run_says_what_the_run_takes_and_writes_nothing(tmp_path: Path) ->
     few = ("recon", "scan.h5", "-m", "sirt", "--iterations", "2", "--memory", "16M", "--dry-run")
     said = beamline(*few)
     assert said.exit_code == 0, said.output
-    assert "200 x 48 x 48 voxels by sirt, from 60 views" in said.stdout and "about" in said.stdout
+    assert "200 x 48 x 48 voxels with sirt, from 60 projections" in said.stdout and "about" in said.stdout
     data = json.loads(beamline(*few, "--json").stdout.splitlines()[-1])
     assert data["slabs"] > 1 and data["memory"] <= 16_000_000 < data["at_once"]
     assert data["output"] == 4 * 200 * 48**2 and data["scratch"] == 4 * 60 * 200 * 48 + 2 * data["output"]
