@@ -85,7 +85,7 @@ class RunServer:
             conf = {**others, "EPICS_PVAS_INTF_ADDR_LIST": address}
             self._server = Server(providers=[provider], conf=conf, useenv=False)
         except RuntimeError as error:
-            raise DataError(f"{address} cannot be listened at: {error}. Nothing was started.") from error
+            raise DataError(f"{address} cannot be used: {error}. Nothing was started.") from error
 
     @property
     def configuration(self) -> dict[str, str]:

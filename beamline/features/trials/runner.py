@@ -169,7 +169,7 @@ def compare(plan: Plan, file: Path | str, folder: Path, *, as_json: bool) -> Tri
         answer.lines = text(table), f"\n{'report':<10}{folder / table.page}"
     if table.stopped:
         counts = f"{len(table.compared)} of {len(table.todo)} trials"
-        raise ScanStopped(f"The {table.name} was stopped after {counts}; their results are in {folder}.")
+        raise ScanStopped(f"The {table.name} was stopped after {counts}. The results are in {folder}.")
     return table
 
 
@@ -223,7 +223,9 @@ def with_references(data: TrialData, references: Sequence[MethodTrial], run: Run
     for reference in references:
         outcome, volume = run(data, reference)
         if volume is None:
-            raise DataError(f"{reference.label}, to compare with, failed: {outcome.message}. Nothing was written.")
+            raise DataError(
+                f"The reference for the comparison ({reference.label}) failed: {outcome.message}. Nothing was written."
+            )
         volumes[reference.method] = volume
     contrast = next(iter(volumes.values())) if data.truth is None else data.truth
     regions = regions_of(Volume(contrast, Grid.matching(data.geometry)), data.seed)

@@ -157,7 +157,7 @@ def test_ended_at_once_the_labels_tell_of_the_frames_that_are_there(
 def test_a_scan_too_large_for_its_disk_or_memory_is_not_begun(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = left(folder)
     for arguments, code, words in (
-        (("--out", "scan.h5", *HUGE), 5, r"scan.h5 would take 23\.4 TB with 1000004 frames, its disk has .* free"),
+        (("--out", "scan.h5", *HUGE), 5, r"scan.h5 needs 23\.4 TB for 1000004 frames, but its disk has .* free"),
         (
             ("--truth", "t.h5", "--truth-bin", "1"),
             2,
