@@ -1,4 +1,4 @@
-"""The command `beamline`: imports the subcommand in use, maps errors to exit codes, and outlives a closed terminal."""
+"""The command `beamline`: loads the subcommand in use, turns errors into exit codes, and survives a closed terminal."""
 
 from __future__ import annotations
 

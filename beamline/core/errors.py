@@ -1,4 +1,4 @@
-"""Errors with exit codes: each class says which part failed and whether data are safe. A defect leaves a traceback."""
+"""Errors with exit codes. The class says which part failed and whether data are safe; a defect leaves a traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines of events from another process, or of a log: the event, or its values alone."""
+"""Lines of events from another process or from a log: parsing them into events or plain values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Events: everything that happens in a run, one class a kind. Terminal, events.jsonl and log are sinks of them.
+"""Events: everything that happens in a run, one class per kind. Sinks (terminal, events.jsonl, log) receive them.
 
 Here are the kinds of a scan and of any command; `recon_events` has those of reconstructions.
 """

@@ -1,4 +1,4 @@
-"""Files: only regular ones are read; a file is written whole or not at all, and replaces none unless asked."""
+"""Files: only regular files are read; a file is written completely or not at all, and replaces none unless asked."""
 
 from __future__ import annotations
 

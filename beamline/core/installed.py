@@ -1,4 +1,4 @@
-"""What is installed: the version, the configurations and scenes of the package, and modules by the names of ours."""
+"""What is installed: the version, the configurations and scenes of the package, and advice for broken installations."""
 
 from __future__ import annotations
 

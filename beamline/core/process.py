@@ -1,4 +1,4 @@
-"""Child processes: each starts in its own process group, is read line by line, and ended in time."""
+"""Child processes: started in their own process group, read line by line, and ended within a time limit."""
 
 from __future__ import annotations
 

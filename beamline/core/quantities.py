@@ -1,4 +1,4 @@
-"""Quantities: that of a volume's voxels, with its unit; and plausible ranges of those of an instrument.
+"""Quantities: what the voxels of a volume are, with units; and the plausible ranges of values of an instrument.
 
 Every type accepts a value in a mistaken unit, such as eV for keV.
 """

@@ -1,4 +1,4 @@
-"""Events of a reconstruction, of one that follows a scan, and of trials of reconstructions."""
+"""Events of a reconstruction, of a reconstruction that follows a scan, and of trials."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requests to end work early: a scan's StopRequest, the stop scope of a reconstruction, and signals that ask for one.
+"""Requests to end work early: StopRequest of a scan, stop scope of a reconstruction, and the signals that ask for it.
 
 The first signal asks for a stop with the data so far, the second ends at once. Python lets only the main thread catch
 signals. Other threads catch nothing; there the request to stop must come from its owner.

@@ -1,4 +1,4 @@
-"""Text for people: angles, sizes, numbers of things, index ranges."""
+"""Text for people: angles, sizes, numbers of things, ranges of indices."""
 
 from __future__ import annotations
 

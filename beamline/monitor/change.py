@@ -1,4 +1,4 @@
-"""Change: the difference of a view from earlier ones that the turning of the sample does not explain.
+"""Change: the difference between a projection and earlier ones that the rotation of the sample does not explain.
 
 Between neighbouring views each cell goes on as it did: depth + velocity, from the last four views. The rest is fitted
 by least squares with four causes: more light everywhere (gain), the sample elsewhere (across, down), and a step of the

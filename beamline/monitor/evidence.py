@@ -1,4 +1,4 @@
-"""Evidence: what darks, flats and some views show, frame by frame, of a running scan or of a file."""
+"""Evidence: statistics of darks, flats and some projections, of a running scan or of a file."""
 
 from __future__ import annotations
 

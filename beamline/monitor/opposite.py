@@ -1,4 +1,4 @@
-"""Opposite: compares a view with the view from the other side, or with a repetition: a displaced or changed sample.
+"""Check `opposite`: compares a projection with the opposite one, or with a repetition, to find motion and change.
 
 Parallel rays see the same from both sides: p(angle + 180°, u) = p(angle, -u), u from the axis. A view is kept every few
 degrees; the view half a turn later, mirrored, or a full turn later, is laid on it. The best fit gives the axis, and a

@@ -1,4 +1,4 @@
-"""View: a projection as the checks see it, line integrals on a coarse grid; the same for a large frame and a small one.
+"""View: a projection as the checks use it, as line integrals on a coarse grid, the same for large and small frames.
 
 Made once a frame for all checks. The grid has 128 to 255 columns of square cells, which are as many pixels as that
 takes: a check then costs no more on 2304 x 4096 pixels than on 128 x 512, and its limits in cells mean the same share

@@ -1,4 +1,4 @@
-"""What can be measured after a pass, what each choice costs and would bring, and which one a target asks for."""
+"""The choices after a pass: their cost, their expected improvement, and the one that the target asks for."""
 
 from __future__ import annotations
 

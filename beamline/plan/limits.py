@@ -1,4 +1,4 @@
-"""Plan checks: positions of triggers in counts, the limits that a plan breaks, and remarks for the operator."""
+"""Checks of a plan: positions of the triggers in counts, violated limits, and remarks for the operator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Passes: the parts of a scan's views, and what can be measured after each."""
+"""Passes: parts of the projections of a scan, and the choices of what to measure after each."""
 
 from __future__ import annotations
 

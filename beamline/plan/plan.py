@@ -1,4 +1,4 @@
-"""ScanPlan: the planned scan as a value, and its angles by each scheme; its timeline gives times, speeds and bytes."""
+"""ScanPlan: the planned scan as a value, with its angles by each scheme."""
 
 from __future__ import annotations
 

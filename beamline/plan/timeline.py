@@ -1,4 +1,4 @@
-"""Timeline: a plan computed for one stage and one camera, as values and as lines for the operator.
+"""Timeline: speeds, times and sizes of a plan with one stage and one camera, as values and as lines for the operator.
 
 Darks then flats come before the views; offset views, flats, then darks after them. A fly scan turns at step /
 period, rounded to whole counts a second (the views' block has that period). It starts far enough before the first pulse

@@ -1,4 +1,4 @@
-"""Budget: of the methods that a choice tries, those whose forecast ends in time."""
+"""Budget: selects the methods that `auto` may try within a time limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checkpoints of a fit: keeps its state with its origin, and checks the origin before a fit resumes."""
+"""Checkpoints of a fit: saves its state with its origin, and checks the origin before the fit is resumed."""
 
 from __future__ import annotations
 

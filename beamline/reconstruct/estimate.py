@@ -1,4 +1,4 @@
-"""Estimate of a reconstruction before it begins: memory, time, and bytes on disk."""
+"""Estimates memory, time and disk space of a reconstruction before it starts."""
 
 from __future__ import annotations
 

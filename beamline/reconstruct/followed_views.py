@@ -1,4 +1,4 @@
-"""Followed views: which frames of a growing file are views, their geometry, and how far the fit has come with them."""
+"""Projections of a growing file: which frames they are, their geometry, and how many of them the fit has used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Job: views from a source, and the volume that is made of them: at once or in slabs."""
+"""Job: prepares the projections of a source and reconstructs the volume, in one piece or in slabs."""
 
 from __future__ import annotations
 

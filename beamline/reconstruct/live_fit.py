@@ -1,4 +1,4 @@
-"""The live fit: a machine of four states that turns the frames of a growing scan into a volume.
+"""Live fit: reconstructs a volume from the frames of a running scan. A state machine with four states.
 
 ```
 WAITS_FOR_REFERENCES --darks and flats can be used--> WAITS_FOR_AXIS --its column is known--> FEEDS --finish--> ENDED

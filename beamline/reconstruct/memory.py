@@ -1,4 +1,4 @@
-"""The memory of a reconstruction, at once and in slabs, what is refused because of it, and workers elsewhere."""
+"""The memory that a reconstruction needs, in one piece and in slabs, errors if it is too much, and remote workers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options of a reconstruction: scan, selection, method, and where its results go."""
+"""Options of a reconstruction: scan, selection, method, and the files for the results."""
 
 from __future__ import annotations
 

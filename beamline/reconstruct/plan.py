@@ -1,4 +1,4 @@
-"""Plan: memory, disk and slabs of a reconstruction, and what is refused because of them.
+"""Plans a reconstruction: memory, disk and slabs, and errors if they do not suffice.
 
 A run follows the plan that its dry run states.
 """

@@ -1,4 +1,4 @@
-"""Delivery: a volume becomes a file, and then a report with its figures of merit."""
+"""Writes the result of a reconstruction: the volume file, then the report with its figures of merit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Region: a box of the volume at full resolution, from the rows that show it, and the box around the sample."""
+"""Region: reconstructs a box of the volume from the detector rows that show it, and finds the box around the sample."""
 
 from __future__ import annotations
 

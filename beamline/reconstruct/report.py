@@ -1,4 +1,4 @@
-"""The content of the report on a reconstruction: scan, settings, figures of merit, pictures."""
+"""The content of the report of a reconstruction: scan, settings, figures of merit, pictures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Run a method on prepared views, as every command does that makes a volume; its time and its error bars."""
+"""Runs a method on prepared projections, within its time limit, and computes its error bars."""
 
 from __future__ import annotations
 

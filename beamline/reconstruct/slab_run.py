@@ -1,4 +1,4 @@
-"""The slabs of a volume, one after the other, into a partial volume, which a later call may go on with."""
+"""Reconstructs a volume slab by slab into a partial volume, which a later call can continue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Snapshots of a growing volume, and slices of its views: a file and a picture, each replacing the last in one step."""
+"""Snapshots of the live volume and slices of its projections: a file and a picture, each replaced in one step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Truths: the true volume of a sample on the grid of a reconstruction, and volume files measured by it."""
+"""Ground truth: the true volume on the grid of a reconstruction, and the comparison of volume files with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scene files, shipped or of a user, and the truth of their samples: attenuation and labels on a grid."""
+"""Scene files, shipped or from the user, and the ground truth of their samples: attenuation and labels on a grid."""
 
 from __future__ import annotations
 

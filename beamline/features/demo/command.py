@@ -1,4 +1,4 @@
-"""`beamline demo`: a simulated scan from trigger to volume and report, in about a minute."""
+"""`beamline demo`: a simulated scan, from the trigger to the volume and its report, in about a minute."""
 
 from __future__ import annotations
 

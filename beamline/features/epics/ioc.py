@@ -1,4 +1,4 @@
-"""Process variables of the newest run of a folder, by PVAccess (p4p); with --control it takes verbs and answers."""
+"""Process variables of the newest run in a folder, over PVAccess (p4p). With --control clients can control the scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ingest: any scan, frame by frame, into one of our files with statistics of each frame; whole or not at all.
+"""ingest: copies any scan, frame by frame, into one of our files, with statistics of each frame.
 
 Integer frames become an NXtomo. Float frames (the lab's float32 stacks) cannot: NXtomo's data are integers, and a
 rounding would lose what was measured. They keep their type, at the same paths, under the definition

@@ -1,4 +1,4 @@
-"""validate and describe: everything that the rules find in a file of a scan or a volume, and its facts as plain values.
+"""validate and describe: all findings about the file of a scan or a volume, and its facts as plain values.
 
 The rules of storage.rules look at a scan of any format; those at the end at what the camera's count and the clock say
 of its frames: which are lost, repeated or out of order.

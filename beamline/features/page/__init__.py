@@ -1,4 +1,4 @@
-"""Runs and volumes in the browser: the page of a run, the list of runs, and the viewer."""
+"""Pages in the browser: the page of a run, the list of runs, and the viewer of scans and volumes."""
 
 COMMANDS = {
     "runs": ("List the runs in a folder: sample, frames, state, size, flags.", False),

@@ -1,4 +1,4 @@
-"""The page's server: files of the page, the feed of events, tiles, and verbs for who may act.
+"""Web application of the page: its files, the stream of events, image tiles, and commands for authorised users.
 
 A browser is a hostile place: any page that is open beside this one can send requests to it. So each request names a
 host that is ours and carries the token for looking (a cookie). Actions are POST requests of our own origin with the

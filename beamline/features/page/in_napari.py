@@ -1,4 +1,4 @@
-"""Volumes, labels and Gaussians in napari, each in its place and unit."""
+"""Shows volumes, labels and Gaussians in napari, each at its position and in its unit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Server of a run, or of a folder of runs: on this machine alone by default, with new tokens at each start.
+"""Web server for a run or a folder of runs. By default only this computer can reach it; each start makes new tokens.
 
 The page of a folder is a table of its runs, and the page of each below `/run/NUMBER/`.
 """

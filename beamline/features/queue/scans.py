@@ -1,4 +1,4 @@
-"""`beamline scan` of several configurations, or of a table of them."""
+"""`beamline scan` with several configurations, or with a table of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes the scan of a scene into a file like an instrument's, frame by frame; the steps of a frame; an overview."""
+"""Writes the simulated scan of a scene into a file like that of the instrument; lists the steps of a frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The data that all trials of a scan share, and one trial: its reconstruction, and what it measures."""
+"""Runs one trial: reconstructs and measures. Also the data that all trials of a scan share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runner: reads the scan once, runs each trial, writes the table."""
+"""Runner: reads the scan once, runs each trial, and writes the table."""
 
 from __future__ import annotations
 

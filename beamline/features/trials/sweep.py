@@ -1,4 +1,4 @@
-"""Sweep: the same slice with each value of one or two options, and how well each volume predicts views held out."""
+"""Sweep: the same slice with each value of one or two options, scored with held-out projections."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A table of trials as text, pictures and a page, and what follows from it in sentences."""
+"""The results of trials: as text, pictures and a page, with sentences that say what follows."""
 
 from __future__ import annotations
 

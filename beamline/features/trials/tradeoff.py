@@ -1,4 +1,4 @@
-"""Trade-off and studies: which trials they compare.
+"""Trade-off and studies: the lists of trials that they compare.
 
 The registry of methods says which lengths of a method are tried; one without is tried with its defaults.
 """

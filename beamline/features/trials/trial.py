@@ -1,4 +1,4 @@
-"""Trial of a method: what is to be reconstructed, and what became of it; the table of all, and their Pareto front."""
+"""Trial (what to reconstruct), its outcome, the table of all trials, and their Pareto front."""
 
 from __future__ import annotations
 

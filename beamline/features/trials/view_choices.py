@@ -1,4 +1,4 @@
-"""The studies and their registry: each says which views of a scan its rows reconstruct; pure values."""
+"""The studies, and which projections of a scan each of their rows uses; pure values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Align: a pair of views half a turn apart before a scan: where the axis is, how it leans, and how sharp views are."""
+"""Align: finds rotation axis, tilt and focus from two opposite projections, before a scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tune: takes a few darks, flats and views at some exposures, and derives counts, noise and the best exposure.
+"""Tune: takes a few darks, flats and projections at several exposures, and finds counts, noise and the best exposure.
 
 Pairs of frames separate noise from structure. The gain comes from photon transfer (Janesick 2007, Photon Transfer,
 ch. 5): variance of the light over its mean. The noise of a line integral p = ln(flat / view) follows by propagation:
