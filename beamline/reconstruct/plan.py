@@ -54,7 +54,7 @@ from recon.splatting.backend import backend_for
 from recon.voxels.beyond_field import sample_radius
 from recon.voxels.field_edges import taller_than_field
 
-_BATCH = 0.25  # of the memory: views during correction
+_BATCH = 0.25  # fraction of the memory for projections during correction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +62,10 @@ class ReconPlan(Need):
     """How a reconstruction uses memory and disk.
 
     Attributes:
-        needs: of the views, as far as they are known.
+        needs: memory needs, as far as they are known.
         allowed: bytes of memory that may be used.
-        slabs: in which the volume is made; none: at once.
-        missing: those that a partial volume lacks; all without one.
+        slabs: the slabs in which the volume is reconstructed; empty: in one piece.
+        missing: slabs that a partial volume does not have yet; without one, all slabs.
     """
 
     needs: ReconMemory
@@ -83,11 +83,12 @@ def planned(source: ScanSource, options: ReconOptions, needs: ReconMemory) -> Re
     """The plan before any frame is read.
 
     Args:
-        needs: as `recon_memory_of` says.
+        needs: result of `recon_memory_of`.
 
     Raises:
         ConfigError: an option needs more memory than there is.
-        DataError: the smallest slab does not fit, a cone does not fit at once, or slabs of an earlier call are there.
+        DataError: the smallest slab does not fit, a cone-beam volume does not fit in one piece, or there are slabs of
+            an earlier call.
     """
     allowed, at_once = memory_of(options), needs.at_once
     _refuse_views(source, options, needs.geometry)

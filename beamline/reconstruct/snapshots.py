@@ -44,11 +44,11 @@ class Snapshots:
         output = options.target.output
         self.path: Path = output.with_name(f"{output.stem}.snapshot.h5")
         self.picture_path = options.target.live_picture
-        self.drawn = False  # the picture is of this scan
-        self._slices: tuple[PictureRow, ...] = ()  # of the picture, as drawn last: by FBP, and of the volume
+        self.drawn = False  # True if the picture is of this scan
+        self._slices: tuple[PictureRow, ...] = ()  # last drawn rows of the picture: FBP slices, and the volume
         self._grown: tuple[PictureRow, ...] = ()
-        self._at: Sequence[float] | None = None  # z, y and x of the slices by FBP
-        self._unseen: Wedge | None = None  # of the views of these slices
+        self._at: Sequence[float] | None = None  # z, y and x of the FBP slices
+        self._unseen: Wedge | None = None  # missing wedge of the projections of these slices
         self._unit = "mm" if source.pixel_size_mm or options.selection.pixel_size_mm else "px"
 
     def write(self, fit: StreamingFit, axis_col: float) -> None:
@@ -59,7 +59,7 @@ class Snapshots:
             volume=shown.volume,
             length_unit=self._unit,
             raw_file=str(self._source.path.resolve()),
-            title=f"Snapshot from {fit.n_views} views",
+            title=f"Snapshot from {fit.n_views} projections",
             sample=self._sample,
             time=self._clock.now(),
             parameters={
@@ -77,7 +77,7 @@ class Snapshots:
             self._grown = self._rows(fit, record.volume, f"{method}, {_why(errors)}")
             self._write_picture()
         except DataError as error:
-            # Windows does not replace a file that a viewer holds open: the next snapshot will.
+            # Windows does not replace a file that a viewer has open; the next snapshot will replace it.
             self._warn(f"A snapshot could not be written: {error}")
             return
         now = self._clock.now()
@@ -85,7 +85,7 @@ class Snapshots:
         self._sink(SnapshotWritten(*written, method, errors or None, time=now))
 
     def write_slices(self, slices: OrthogonalSlices, n_views: int, heading: str, unseen: Wedge | None) -> None:
-        """Write the picture with these slices by FBP above the last drawn slices of the volume, if there are any."""
+        """Write the picture: these FBP slices, and below them the last drawn slices of the volume if there are any."""
         self._at, self._unseen = slices.at, unseen
         panels = slice_panels(slices.images, slices.at, slices.pixel, self._unit, unseen)
         self._slices = (PictureRow(heading, panels),)
@@ -98,11 +98,11 @@ class Snapshots:
 
     def remove(self) -> None:
         """Remove the snapshot after the final volume is written. The live picture stays."""
-        with suppress(PermissionError):  # Windows removes no file that a viewer holds open
+        with suppress(PermissionError):  # Windows does not remove a file that a viewer has open
             self.path.unlink(missing_ok=True)
 
     def _method(self, shown: BetterVolume) -> tuple[str, dict[str, float]]:
-        """Whose volume is shown, and the errors of both in views held out; none where they were not compared."""
+        """Method of the volume that is shown, and the errors of both methods in held-out projections if compared."""
         fit, found = self._options.streaming.name, shown.errors
         errors = {fit: found.fit, Fbp.name: found.direct} if math.isfinite(found.direct) else {}
         return Fbp.name if shown.direct else fit, errors
