@@ -72,13 +72,13 @@ class SweptTrial(MethodTrial):
 
 
 class UnseenViews(NamedTuple):
-    """The views held out from a trial, and what its volume shows in them.
+    """The held-out projections of a trial, and the forward projection of its volume.
 
     Attributes:
-        ids: rows of the file.
-        data: [view, col, row], as the trial corrects them; pixels that were not measured are NaN.
-        model: [view, col, row] what the volume shows at this resolution.
-        views: those that the trial used; trials with the same ones have the same data.
+        ids: their rows in the file.
+        data: [view, col, row], as the trial corrects them; pixels without data are NaN.
+        model: [view, col, row], forward projection of the volume at this resolution.
+        views: the projections that the trial used; trials with the same projections have the same data.
     """
 
     ids: I64
@@ -88,7 +88,7 @@ class UnseenViews(NamedTuple):
     views: object
 
     def of(self, ids: I64) -> UnseenViews:
-        """Those with these rows of the file."""
+        """The projections with these rows of the file."""
         at = np.searchsorted(self.ids, ids)
         return UnseenViews(ids, self.data[at], self.model[at], self.resolution.select(at), self.views)
 
@@ -96,11 +96,11 @@ class UnseenViews(NamedTuple):
 def sliced(trials: Sequence[ReconOptions]) -> list[ReconOptions]:
     """The same reconstruction options for a few rows around the middle.
 
-    A direct method needs the row of the slice alone, total variation and fits some beside it. Of a cone, and where rows
-    are given, all of them are made.
+    A direct method needs only the row of the slice; total variation and fits need some rows around it. For a cone beam,
+    and if the user gave rows, all of them are reconstructed.
 
     Raises:
-        ConfigError, DataError: a scan or a selection that is refused.
+        ConfigError, DataError: the scan or the selection cannot be used.
     """
     halo = max(min(trial.method.halo, (TRIAL_ROWS - 1) // 2) for trial in trials)
     return [replace(trial, selection=_middle(trial, halo)) for trial in trials]
@@ -119,13 +119,13 @@ def _middle(trial: ReconOptions, halo: int) -> Selection:
 
 
 class SweptScan(TrialScan):
-    """The scan of a sweep. Views are corrected once for all values that do not affect the correction.
+    """The scan of a sweep. Projections are corrected only once for all values that do not affect the correction.
 
-    The rotation axis is found once, so that slices differ by the options alone; where it is swept, views are corrected
-    about the axis in the middle.
+    The rotation axis is found only once, so that slices differ only by the options. If the axis is swept, projections
+    are corrected with the middle axis.
 
     Attributes:
-        unseen: of the trials that were made, by label.
+        unseen: held-out projections of the finished trials, by label.
     """
 
     def __init__(self, trials: Sequence[SweptTrial], sink: Sink, clock: Clock) -> None:

@@ -21,12 +21,12 @@ OVERLAPPING = 180  # Number of overlapping windows of each width
 
 @dataclass(frozen=True, eq=False)
 class ViewChoice:
-    """A choice of views, each the mean of some views of the scan.
+    """A selection of projections; each one is the mean of some projections of the scan.
 
     Attributes:
-        label: in tables.
-        groups: [view, window]: each view is the mean of these views of the scan; None: left out.
-        family: choices of the same family are draws of the same kind; empty: it stands alone.
+        label: its name in tables.
+        groups: [projection, window]: the projections of the scan that are averaged; None: the choice is left out.
+        family: choices of the same family are random selections of the same kind; empty: no family.
         reason: why it is left out.
     """
 
@@ -37,23 +37,23 @@ class ViewChoice:
 
     @property
     def window(self) -> int:
-        """How many views of the scan are averaged into one."""
+        """Number of projections of the scan that are averaged into one."""
         return len(self.groups[0]) if self.groups else 0
 
     @property
     def frames(self) -> int:
-        """Frames of the scan that it takes, each counted once: its dose."""
+        """Number of frames of the scan that it uses, each counted once: its dose."""
         return len({view for group in self.groups or () for view in group})
 
     @property
     def n_views(self) -> int:
-        """Views that it makes; 0 where it is left out."""
+        """Number of projections; 0 if it is left out."""
         return len(self.groups) if self.groups else 0
 
 
 @dataclass(frozen=True)
 class ViewSet:
-    """The views that a study chooses from.
+    """The projections that a study selects from.
 
     Attributes:
         angles: [view], radians.
