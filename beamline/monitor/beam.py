@@ -1,9 +1,9 @@
 """Check `beam`: slow changes of the beam intensity relative to the flats, and sudden ones.
 
-The drift against the flats is judged in air: the brightest place of a view. It is reported when it begins, as a fact
-each time it has doubled. A dip is judged by the change from view to view
-(beamline.monitor.change), which needs no air. These changes have errors of one sign where dense particles turn fast;
-these would sum up to a dip. A change counts only where the light of the whole view moved with it.
+The slow change is measured in air, at the brightest part of a projection. It is reported when it starts, and as info
+each time it has doubled. A sudden change is measured from projection to projection (beamline.monitor.change), which
+needs no air. If dense particles rotate quickly, these changes have errors of one sign, whose sum would look like a loss
+of beam. A change therefore counts only if the intensity of the whole projection changed with it.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ class BeamState:
 
 @dataclass(frozen=True)
 class BeamCheck(Logged):
-    """Score: lost fraction of the light (negative: gained).
+    """Score: lost fraction of the intensity (negative: gained).
 
-    The defaults: 2 % of light are 0.02 of line integral in every ray if nobody corrects it, as air beside the sample
-    allows. 10 % at once are no drift of a ring.
+    The defaults: 2 % of intensity are 0.02 of line integral in every ray, if it is not corrected with the air next to
+    the sample. A sudden change of 10 % cannot be the drift of a ring.
     """
 
     name: ClassVar[str] = "beam"
@@ -134,9 +134,8 @@ class BeamCheck(Logged):
 
 
 def in_air(context: ScanContext) -> float:
-    """Line integral of the brightest place of a view (light lost since the flats); NaN if it may be matter: above
-    COVERED, and unlike the air so far.
-    """
+    """Line integral of the brightest part of a projection (loss of beam since the flats). NaN if it may be sample,
+    because it is above COVERED and unlike the air so far."""
     if context.view is None or context.grid is None or not context.grid.flats:
         return math.nan
     brightest = brightest_place(context.view, context.grid)
@@ -144,7 +143,7 @@ def in_air(context: ScanContext) -> float:
 
 
 def _of_integrals(flag: Flag) -> Flag:
-    """The flag of a file without counts and flats, where nobody knows the light."""
+    """The flag for a file without counts and flats, in which the intensity is not known."""
     off = -math.log1p(-flag.score) if flag.score < 1 else math.inf
     if flag.limit == COVERED:
         advice = f"No line integral of the frame is below {off:.3g}: the sample covers all of it, or air is not at 0."
@@ -161,6 +160,6 @@ def _size(score: float) -> str:
 
 
 def _whole(view: CellView, grid: CellGrid) -> float:
-    """Logarithm of the mean transmission of the lit cells; NaN where none is."""
+    """Logarithm of the mean transmission of the cells with beam; NaN without such cells."""
     lit = grid.lit > 0
     return math.log(float(np.exp(-view.depth[lit]).mean())) if lit.any() else math.nan

@@ -32,8 +32,13 @@ NAMED = 4  # most shadows that the advice names
 
 @dataclass(frozen=True)
 class FieldState:
-    """Whether unlit flats were reported; whether a view held all matter; consecutive views with matter at the edges;
-    whether these were reported.
+    """State.
+
+    Attributes:
+        unlit: True if flats without beam were reported.
+        inside: True if the whole sample was in the field of view in some projection.
+        cut: number of consecutive projections with sample at the edges.
+        reported: True if this was reported.
     """
 
     unlit: bool = False
@@ -44,10 +49,11 @@ class FieldState:
 
 @dataclass(frozen=True)
 class FieldOfViewCheck(Logged):
-    """Score: share of the frame without light (a flat), or line integral at the field's edge (an info, once a scan).
+    """Score: fraction of the frame without beam (flat), or line integral at the edge of the field of view (info, once a
+    scan).
 
-    The defaults: a line integral of 0.1 at the edges is a tenth of the value in a sample's middle. It is more than
-    phase fringes and scattered light leave there. Slits usually shadow a line or two at the frame's edges.
+    The defaults: a line integral of 0.1 at the edges is a tenth of the value in the middle of a sample, and more than
+    phase fringes and scattered radiation leave there. Slits usually shadow a line or two at the edges of the frame.
     """
 
     name: ClassVar[str] = "field"
@@ -146,7 +152,8 @@ class MassState:
 
 @dataclass(frozen=True)
 class MassCheck(Logged):
-    """Score: relative change of the mean line integral. None without light, or if the sample exceeds the field."""
+    """Score: relative change of the mean line integral. Not applied without beam, or if the sample is larger than the
+    field of view."""
 
     name: ClassVar[str] = "mass"
     bit: ClassVar[int] = 5
@@ -221,12 +228,13 @@ class PixelsState:
 
 @dataclass(frozen=True)
 class PixelsCheck(Logged):
-    """Score: fraction of the pixels that are dead: in all flats of the scan's first group they have less than a fifth
-    of the light around them. It is reported at the first view, as a fact where they are few. In a view also the
-    fraction that holds no number (NaN, infinite, beyond LARGEST) but does in the darks and flats; in any frame where
-    none does.
+    """Score: fraction of dead pixels, which in all flats of the first group have less than a fifth of the intensity
+    around them. It is reported at the first projection, as info if they are few. Of a projection, the score is also
+    the fraction of pixels that have no valid value (NaN, infinite, beyond LARGEST) although they have one in darks
+    and flats; of any frame, it is 1 if no pixel has a valid value.
 
-    The default: a thousandth of the pixels are one in every column of a detector of 1000 rows, each a ring in a slice.
+    The default: a thousandth of the pixels is one pixel in every column of a detector of 1000 rows, each of which makes
+    a ring in a slice.
     """
 
     name: ClassVar[str] = "pixels"
@@ -283,7 +291,7 @@ class PixelsCheck(Logged):
 
 
 def _dead(frame: Frame, digest: FrameDigest, context: ScanContext) -> PixelPlaces:
-    """Places of the pixels of a flat that are dark within a lit block."""
+    """Positions of the pixels of a flat that are dark in a block with beam."""
     above = light(digest.preview, context)
     block = math.ceil(frame.counts.shape[1] / above.shape[1])
     dark = digest.preview - above

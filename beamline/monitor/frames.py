@@ -24,7 +24,7 @@ FEW_PIXELS = 2  # fewer may be hot pixels that the darks did not show
 
 @dataclass(frozen=True)
 class SaturationState:
-    """`hot`: the fraction of the pixels that is saturated even without light."""
+    """State. hot: fraction of the pixels that are saturated even without beam."""
 
     hot: float = 0.0
 
@@ -61,12 +61,12 @@ class SaturationCheck(Logged):
 
 @dataclass(frozen=True)
 class StuckState:
-    """Checksum and metadata of the frame before.
+    """Checksum and metadata of the previous frame.
 
     Attributes:
-        checksum, angle: of it.
-        repeats: how many frames in a row have had this checksum.
-        noiseless: darks or flats of a single grey value repeat: a simulation without noise.
+        checksum, angle: of the previous frame.
+        repeats: number of frames in a row with this checksum.
+        noiseless: True if darks or flats of a single grey value repeat, as in a simulation without noise.
     """
 
     checksum: int | None = None
@@ -172,9 +172,10 @@ class DarkState:
 
 @dataclass(frozen=True)
 class DarkCheck(Logged):
-    """Score: counts of drift. Light in darks is a finding of `beamline.monitor.references`.
+    """Score: drift in counts. Beam in darks is a finding of `beamline.monitor.references`.
 
-    The drift is a trimmed mean over the preview's blocks: one zinger moves the mean of a small frame by tens of counts.
+    The drift is a trimmed mean over the blocks of the preview, because one zinger changes the mean of a small frame by
+    tens of counts.
     """
 
     name: ClassVar[str] = "dark"
@@ -203,7 +204,7 @@ class DarkCheck(Logged):
 
 
 def _trimmed_mean(values: NDArray[np.float32]) -> float:
-    """Mean without the lowest and highest few (at least one each, where there are three)."""
+    """Mean without some of the lowest and highest values (at least one of each, if there are three values)."""
     ordered = np.sort(values, axis=None)
     cut = min(max(1, ordered.size // TRIM), (ordered.size - 1) // 2)
     return float(ordered[cut : ordered.size - cut].mean())
@@ -216,10 +217,10 @@ class LostState:
 
 @dataclass(frozen=True)
 class LostCheck:
-    """Score: lost fraction of the light on nine tenths of the frame, relative to the last view with light.
+    """Score: lost fraction of the intensity in nine tenths of the frame, relative to the last projection with beam.
 
-    The default: neither drift nor the decay of a ring's current between two top-ups takes half of the light. A sample
-    that turns takes no light from all places at once.
+    The default: neither drift nor the decay of the ring current between two top-ups takes half of the intensity. A
+    rotating sample does not darken all places at once.
     """
 
     name: ClassVar[str] = "lost"

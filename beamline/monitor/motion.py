@@ -1,10 +1,10 @@
 """Check `motion`: finds jumps, slips and shaking of the sample, beyond its steady rotation.
 
-Shake is random displacement from view to view, by vibration or runout of the stage.
-A view that stands x beside its way changes its own comparison with the views before by x, and the next one by -4/3 x:
-there it is the view before, and a third of the velocity. So changes that follow one another have a covariance of -4/3
-of the variance of x. What a model of the turning sample does not know changes slowly: its covariance is positive. This
-tells both apart, whatever the sample.
+Shaking is random displacement from projection to projection, by vibration or runout of the stage. If a projection is
+displaced by x, its own change relative to the projections before is x, and the change of the next one is -4/3 x,
+because there the displaced projection is the previous one and a third of the velocity. Consecutive changes therefore
+have a covariance of -4/3 of the variance of x. Errors of the model of the rotating sample change slowly, so their
+covariance is positive. This distinguishes the two, whatever the sample.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ class Axis:
         return Axis(usual, away, square, product, noise)
 
     def size(self, pairs: int) -> float:
-        """Size of the shake: standard deviation in pixels, less the noise; 0 if noise alone may explain it.
+        """Size of the shaking: standard deviation in pixels without the noise; 0 if noise alone can explain it.
 
-        The squares tell it more exactly than the products, where these confirm it.
+        The squares give it more precisely than the products, if the products confirm it.
         """
         variance, n = -self.product / OWN, min(pairs, round(2 / SHAKE_MEMORY))
         if pairs < PAIRS or variance < self.noise * (1 + SHAKE_SIGMAS * SPREAD / math.sqrt(n)):
@@ -98,8 +98,14 @@ CONFIRMED = 0.5  # of a figure; if less of it differs from row to row, this part
 
 @dataclass(frozen=True)
 class MotionState:
-    """Usual shifts across and down in pixels and turns in steps; `quiet`: views in which a jump echoes; `told`: pixels
-    of the shake that was flagged last, 0: none, or it has gone."""
+    """State.
+
+    Attributes:
+        across, down: usual shifts in pixels.
+        turn: usual excess rotation in steps.
+        quiet: number of projections in which a jump still has an effect.
+        told: size in pixels of the shaking that was flagged last; 0 if none was, or if it has ended.
+    """
 
     across: FrameScatter = field(default_factory=FrameScatter)
     down: FrameScatter = field(default_factory=FrameScatter)
@@ -168,7 +174,7 @@ class MotionCheck(Logged):
     def _jump(
         self, state: MotionState, after: MotionState, row: int, change: SampleChange
     ) -> CheckResult[MotionState] | None:
-        """A jump or a slip; None where there is none."""
+        """The flag for a jump or a slip; None if there is none."""
         usual = state.across, state.down, state.turn
         change_of_place = change.across, change.down, change.turn
         limits = self.alarm, self.alarm, self.steps

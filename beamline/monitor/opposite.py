@@ -55,10 +55,13 @@ class Kept:
 
 @dataclass(frozen=True, eq=False)
 class ViewFit:
-    """The fit of a view to another: its shift across and down, with the standard deviation `sigma` by noise, and the
-    remainder as a shift; all in pixels. `places`: sum of squares of the shares that the places of single views have in
-    the shift. `unsure`: by how many pixels the extrapolation of the kept view may err by itself, without any motion; 0
-    where that is within the limit of a change.
+    """The fit of one projection to another, in pixels: shift across and down, its standard deviation `sigma` by noise,
+    and the remainder as an equivalent shift.
+
+    Attributes:
+        places: sum of squares of the weights that the positions of single projections have in the shift.
+        unsure: possible error of extrapolating the kept projection without any motion; 0 if it is within the limit
+            of a change.
     """
 
     across: float
@@ -80,10 +83,12 @@ class OppositeState:
 
 @dataclass(frozen=True)
 class OppositeCheck(Logged):
-    """Score: motion of the sample in pixels, or the motion of all of it that would change the view equally.
+    """Score: motion of the sample in pixels, or the motion of the whole sample that would change the projection as
+    much.
 
-    The defaults: as for `motion` half a pixel, which doubles edges as far as the resolution. Or a twentieth of a cell
-    where that is more, since a shift is known no better. Flat faces and coarse steps leave a remainder of 0.3 cells.
+    The defaults: half a pixel, as for `motion`, because it doubles edges by as much as the resolution; or a twentieth
+    of a cell if that is more, because shifts are not known better. Flat faces and coarse steps leave a remainder of 0.3
+    cells.
     """
 
     name: ClassVar[str] = "opposite"
@@ -120,8 +125,9 @@ class OppositeCheck(Logged):
     def _compared(
         self, state: OppositeState, at: int, view: CellView, context: ScanContext
     ) -> CheckResult[OppositeState] | None:
-        """The view against one that was kept; None where they are neither opposite nor at one angle, or where the step
-        that gives its velocity is far and only a larger motion would show: the pair waits for views that are nearer."""
+        """Compare a projection with a kept one. None if they are neither opposite nor at the same angle, or if the step
+        that gives the velocity is so large that only a larger motion would show; the pair then waits for nearer
+        projections."""
         one, grid = state.kept[at], context.grid
         assert one.after is not None and grid is not None
         turn, step = _folded(view.angle - one.view.angle), one.after.angle - one.view.angle
@@ -146,12 +152,13 @@ class OppositeCheck(Logged):
         return replace(looked, state=replace(looked.state, kept=(*state.kept[:at], one, *state.kept[at + 1 :])))
 
     def _unsure(self, one: Kept, after: CellView, steps: float, grid: CellGrid) -> float:
-        """Largest likely error, px, of a kept view extrapolated by some steps, see `ViewFit.unsure`.
+        """Largest likely error in px of a kept projection extrapolated by some steps, see `ViewFit.unsure`.
 
-        A far step shows other matter, most of all of a sample that is wider than the field. While the two views of it
-        differ by less than the smoothing, the line through them errs by its second derivative, which of a picture that
-        is smoothed so is at most √1.5 / SMOOTH of the first one. Where they differ by more, or the sample moved between
-        them, by more than the rim turns, there is no velocity: infinite.
+        A large step shows other material, most of all if the sample is wider than the field of view. If the two
+        projections of the step differ by less than the smoothing, the error of the line through them comes from the
+        second derivative, which is at most √1.5 / SMOOTH of the first one in a picture smoothed like this. If they
+        differ by more, or if the sample moved between them by more than the rim turns, the velocity is not known and
+        the result is infinite.
         """
         if min(abs(steps), abs(steps - 1)) < BESIDE - 1:
             return 0.0
@@ -234,9 +241,9 @@ def _folded(angle: float) -> float:
 
 
 def lay_on(one: Kept, steps: float, view: CellView, grid: CellGrid, *, mirrored: bool) -> ViewFit | None:
-    """Best fit of the kept view to a view some steps later; None if the view has too little structure.
+    """Best fit of the kept projection to a projection some steps later; None if that one has too little structure.
 
-    Least squares over light, shift across and shift down, from the best whole number of cells on.
+    Least squares for intensity, shift across and shift down, starting from the best whole number of cells.
     """
     assert one.after is not None
     first, last = grid.left, grid.right + 1

@@ -50,17 +50,24 @@ INVALID = 1e-3  # pixels that are not finite, beyond those of the group's best f
 
 @dataclass(frozen=True)
 class ReferenceLimits:
-    """Limits of the references, each with its reason.
+    """Limits for darks and flats, with reasons.
 
-    saturated: as the alarm of the check `saturation`: a cosmic ray hits a pixel or two, one in a thousand is exposure.
-    light_over_noise: a flat at the darks' level has no light; three times the noise of a pixel is the least that can
-        be told.
-    light_gone: half of the light does not go by drift, top-up or decay of the ring's current. Against the brightest
-        flats and against the views, which no sample makes brighter.
-    uneven: flats are averaged, and views divided by the average; 0.1 of light is 0.1 of line integral.
-    unlit: a beam may be narrower than the detector, but not so that most of it is dark.
-    light_in_darks: darks that are lit have a share of the flats' level and, since light brings its noise, of their
-        variance. An offset has only the former, readout noise only the latter. A fifth of both is neither.
+    saturated: as for an alarm of the check `saturation`. A cosmic ray hits a pixel or two; one pixel in a thousand is
+    too long an exposure.
+
+    light_over_noise: a flat at the level of the darks has no beam. Three times the noise of a pixel is the smallest
+    difference that can be detected.
+
+    light_gone: no drift, top-up or decay of the ring current takes half of the intensity. Flats are compared with the
+    brightest flats, and with the projections, which no sample makes brighter.
+
+    uneven: flats are averaged, and projections are divided by the mean. 0.1 of intensity is 0.1 of line integral.
+
+    unlit: a beam may be narrower than the detector, but most of the detector must get beam.
+
+    light_in_darks: darks that were exposed have part of the level of the flats and, because of photon noise, part of
+    their variance. An offset raises only the level, readout noise only the variance. A fifth of both cannot come from
+    these.
     """
 
     saturated: float = setting(1e-3, "fraction of the pixels of a flat that may be saturated", ge=0, lt=1)
@@ -77,10 +84,10 @@ DARK, FLAT = FrameKind.DARK, FrameKind.FLAT
 
 
 def judge(evidence: Evidence, limits: ReferenceLimits | None = None) -> tuple[Finding, ...]:
-    """Findings on darks and flats: errors on all of a kind, warnings on frames beside good ones.
+    """Findings about darks and flats: errors if all of a kind are bad, warnings if good frames remain.
 
-    A rule does not see the frames that earlier ones found, unless none would be left: then later ones mean nothing.
-    Rules that compare flats with the sample need `cells`.
+    A rule does not see the frames that earlier rules found. If these were all frames of a kind, later rules are not
+    applied. Rules that compare flats with the sample need `cells`.
     """
     judged: list[Finding] = []
     for name, kind, rule in RULES:
@@ -130,7 +137,7 @@ def _unwritten(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
 
 
 def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames]:
-    """Darks above the darkest of their exposure: light only adds to counts."""
+    """Darks that are brighter than the darkest one of the same exposure, because beam only adds counts."""
     darks = evidence.frames(DARK)
     flats = [level([frame]) for frame in evidence.frames(FLAT) if not frame.blank]
     for exposure in {frame.rounded_exposure for frame in darks}:
@@ -149,9 +156,10 @@ def _above_darkest(evidence: Evidence, _: ReferenceLimits) -> Iterator[BadFrames
 
 
 def _saturated(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats with many pixels at the end of their counts, or all at one number.
+    """Flats with many saturated pixels, or with the same value in all pixels.
 
-    Not those that were written, not exposed: the number that stands for all light, such as 65535 beside 0.
+    Flats that were written instead of exposed are allowed: a single value that means full intensity, such as 65535 with
+    darks of 0.
     """
     darks = evidence.frames(DARK)
     hot = float(np.median([dark.saturated for dark in darks])) if darks else 0.0
@@ -190,7 +198,7 @@ def _without_beam(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
 
 
 def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats with much less light than the brightest group."""
+    """Flats with much less intensity than the brightest group."""
     bright, limit = evidence.brightest, limits.light_gone
     for group in evidence.of_kind(FLAT):
         gone = np.array([1 - evidence.light_of([flat]) / evidence.light_of(bright) for flat in group])
@@ -203,7 +211,7 @@ def _beam_lost(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrame
 
 
 def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats darker than views, if both exposures are known: a sample only takes light."""
+    """Flats that are darker than projections, if both exposures are known, because a sample can only absorb."""
     views = [view for view in evidence.views if view.saturated <= limits.saturated and view.exposure > 0]
     limit = 1 - limits.light_gone
     for group in evidence.of_kind(FLAT) if views else ():
@@ -217,7 +225,8 @@ def _dimmer_than_views(evidence: Evidence, limits: ReferenceLimits) -> Iterator[
 
 
 def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats with other light than most of their group, as a whole or in places; all, where half of them have."""
+    """Flats whose intensity differs from most of their group, as a whole or locally. If half of them differ, all
+    flats."""
     base, limit = offset(evidence.darkest), limits.uneven
     for group in evidence.of_kind(FLAT):
         light = np.stack([(flat.blocks - base) / flat.seconds for flat in group])
@@ -248,7 +257,7 @@ def _uneven(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
 
 
 def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Flats that leave most of the frame dark."""
+    """Flats in which most of the frame gets no beam."""
     for group in evidence.of_kind(FLAT):
         light = np.mean([flat.blocks for flat in group], axis=0) - offset(evidence.darkest)
         score, limit = float((light < UNLIT * np.nanpercentile(light, BRIGHT)).mean()), limits.unlit
@@ -260,7 +269,7 @@ def _mostly_unlit(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFr
 
 
 def _light_in_darks(evidence: Evidence, limits: ReferenceLimits) -> Iterator[BadFrames]:
-    """Darks with the level and the noise of light."""
+    """Darks with the level and the noise of an exposed frame."""
     flats = evidence.brightest
     for darks in evidence.of_kind(DARK) if flats else ():
         share = level(darks) / level(flats) if level(flats) > 0 else np.inf

@@ -71,13 +71,15 @@ def _nearest_view(image: F32, others: Sequence[F32], views: Sequence[F32]) -> tu
 
 
 class ViewsAboveFlats(NamedTuple):
-    """How much brighter than each group of flats [group] views are where they are emptiest, as line integrals.
+    """How much brighter projections are than each group of flats [group], at places with the least sample, as line
+    integrals.
 
     Attributes:
-        brightest: in the places where views are brightest; an open beam: 0.
-        at_edges: at that edge of the field, left or right, where it is less.
-        mismatch: by how much each group differs in places from the group with the least `brightest`, factors aside.
-        limit: what noise does not reach.
+        brightest: at the places at which projections are brightest; 0 for an open beam.
+        at_edges: at the left or right edge of the field of view, whichever is less.
+        mismatch: largest local difference between each group and the group with the smallest `brightest`, apart
+            from a factor.
+        limit: value that noise does not reach.
     """
 
     brightest: F64
@@ -108,9 +110,10 @@ def _views_above_flats(evidence: Evidence) -> ViewsAboveFlats | None:
 
 
 def flats_below_views(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """Groups of flats that are darker than views in places where other flats are not: an object was in the beam.
+    """Groups of flats that are locally darker than projections although other flats are not: an object was in the beam.
 
-    Where two groups differ in shape, the views tell which of them is the open beam: a sample only takes light.
+    If two groups differ in shape, the projections show which of them is the open beam, because a sample can only
+    absorb.
     """
     groups = evidence.of_kind(FrameKind.FLAT)
     if len(groups) < 2 or (above := _views_above_flats(evidence)) is None:
@@ -139,11 +142,13 @@ def views_brighter(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 
 def sample_in_all_flats(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
-    """All flats show the sample, even at an angle of no view or displaced.
+    """All flats show the sample, also if it was at another angle than in any projection, or displaced.
 
-    A sample in the flats has the mass of that in the views, so that the views divided by the flats hold none: they are
-    as much brighter in places as darker in others. Or they turn more than they hold: whatever the flats are, the views
-    differ by the sample alone, which is nowhere less than nothing in the emptiest views. Air is at the edges of rows.
+    Two signs: (1) If the sample is in flats and projections, both absorb the same in total. Divided by the flats, the
+    projections then have no net absorption: they are brighter at some places by as much as they are darker at others.
+    (2) The rotating part of the sample absorbs more than the projections show relative to the flats. It is measured by
+    the differences between projections, with its smallest absorption set to zero, because these do not depend on the
+    flats. Air is assumed at the edges of rows.
     """
     if (depth := _depth_over_air(evidence)) is None:
         return
@@ -185,9 +190,9 @@ def views_show_nothing(evidence: Evidence, _: Any) -> Iterator[BadFrames]:
 
 
 def _depth_over_air(evidence: Evidence) -> F64 | None:
-    """Line integrals [view, row, col] of places, less the straight line between the edges of each row.
+    """Line integrals [view, row, col] of places, minus the straight line between the edges of each row.
 
-    Only views that have air there; None where they or places are too few.
+    Only of projections that have air at the edges. None if there are too few of them, or too few places.
     """
     light = np.mean([evidence.light(flat) for flat in evidence.frames(FrameKind.FLAT)], axis=0)
     lit = lit_places(light)
@@ -209,7 +214,8 @@ def _depth_over_air(evidence: Evidence) -> F64 | None:
 
 
 def log_ratio(image: F32, other: F32, lit: Mask) -> F32:
-    """Logarithm of the one over the other where there is light; what has none counts as a thousandth."""
+    """Logarithm of the ratio of two images at places with beam. Values near zero count as a thousandth of the bright
+    part."""
     least = 1e-3 * float(np.percentile(np.maximum(image, other)[lit], BRIGHT)) if lit.any() else 1.0
     least = max(least, 1e-30)
     return np.asarray(np.log(np.maximum(image[lit], least) / np.maximum(other[lit], least)), np.float32)
@@ -224,7 +230,7 @@ def _spread(values: F32) -> float:
 
 
 def _beyond_noise(values: F32) -> float:
-    """Their spread without the noise; 0 where it may all be noise."""
+    """Standard deviation of the values without the noise; 0 if all of it may be noise."""
     spread, noise = _spread(values), place_noise(values)
     chance = 1 + SIGMAS * (2 / max(values.size, 1)) ** 0.5
     return (spread**2 - noise**2) ** 0.5 if spread**2 > chance * noise**2 else 0.0

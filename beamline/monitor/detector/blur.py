@@ -56,12 +56,12 @@ class BlurState:
 
 @dataclass(frozen=True)
 class BlurCheck(Logged):
-    """Score: fraction of its fine contrast that a view has lost relative to the views before.
+    """Score: fraction of fine contrast that a projection has lost relative to the projections before.
 
-    The default: a blur of 0.7 pixels (sigma) takes 0.3 of it from round particles and 0.4 from flat faces. A slow loss
-    is a fact (info) where both directions have it: a sample with flat faces turns its sharp edges away as well. Fringes
-    are a fact, too: their score is how far line integrals beside an outer edge fall below the air, as a share of the
-    step at the edge.
+    The default: a blur of 0.7 pixels (sigma) takes 0.3 of the fine contrast of round particles, and 0.4 of flat faces.
+    A slow loss is reported as info if both directions have it, because a sample with flat faces also turns its sharp
+    edges away. Phase fringes are reported as info, too: their score is how far line integrals next to an outer edge
+    fall below the air, as a fraction of the step at the edge.
     """
 
     name: ClassVar[str] = "blur"
@@ -89,7 +89,7 @@ class BlurCheck(Logged):
         return CheckResult(after, Flag(self.name, Level.INFO, frame.index, overshoot.share, LEAST_SHARE, advice))
 
     def _loss_of(self, state: BlurState, frame: Frame, context: ScanContext) -> CheckResult[BlurState]:
-        """What the frame has lost beside the views before."""
+        """The loss of sharpness of the frame relative to the projections before."""
         if frame.kind is not FrameKind.PROJECTION:
             return CheckResult(_with_reference(state, frame))
         if context.view is None:
@@ -139,7 +139,8 @@ def sharpness(lines: NDArray[Any], dark: CellValues | None, flat: CellValues | N
     """Ratio of fine to coarse contrast, along rows and along columns; NaN without contrast.
 
     Args:
-        lines: counts [line, col] of strips of `STRIP` neighbouring rows; `dark` and `flat` likewise.
+        lines: counts [line, col] of strips of `STRIP` neighbouring rows.
+        dark, flat: the same lines of the mean dark and the mean flat.
     """
     low = np.zeros_like(lines, np.float32) if dark is None else dark
     if flat is None:

@@ -23,11 +23,11 @@ ALIKE = 0.5  # allowed difference between the parts, as a fraction of the change
 
 @dataclass(frozen=True)
 class GainCheck(Logged):
-    """Score: relative change of the light, equal in all places, since the view before (beamline.monitor.change).
+    """Score: uniform relative change of the intensity since the previous projection (beamline.monitor.change).
 
-    The default: flats divide a step out only if they are taken anew. 1 % of light is 0.01 of line integral in every
-    ray, a fifth of what 50 um of electrolyte do. A ring that is topped up every few minutes steps by less. The figure's
-    own noise is 1e-4 on 128 x 512 pixels of 5000 photons.
+    The default: a change is corrected only if flats are taken again. 1 % of intensity is 0.01 of line integral in every
+    ray, a fifth of what 50 um of electrolyte absorb. A top-up of the ring every few minutes changes the intensity by
+    less. The noise of the score is 1e-4 for 128 x 512 pixels with 5000 photons.
     """
 
     name: ClassVar[str] = "gain"

@@ -1,8 +1,8 @@
 """Check `ghost`: a broad shadow or reflection that crosses the field of view from side to side.
 
-As for a floater the filters suppress everything that turns with the stage (`fan`). But they use the
-mean of all rows on broad columns, for a hump as broad as a part of the field. In one cell 2 % of light are below the
-noise. In the mean of thousands of pixels they are a hundred times its noise.
+As in the check `floater`, filters suppress everything that rotates with the stage (`fan`). Here they use the mean of
+all rows in broad columns, because a ghost is as broad as a part of the field of view. In a single cell, 2 % of
+intensity are below the noise; in the mean of thousands of pixels they are a hundred times the noise.
 """
 
 from __future__ import annotations
@@ -132,9 +132,8 @@ class GhostState:
 
 @dataclass(frozen=True)
 class GhostCheck(Logged):
-    """Score: relative change of the light in the middle of the ghost, without its sign. In the few views of a window, a
-    ghost that leaves a place looks like a shadow that comes.
-    """
+    """Score: absolute relative change of the intensity in the middle of the ghost. It has no sign, because in the few
+    projections of a window a ghost that leaves a place looks like a shadow that arrives."""
 
     name: ClassVar[str] = "ghost"
     bit: ClassVar[int] = 11
@@ -212,7 +211,7 @@ class GhostCheck(Logged):
 
 
 def _profiles(depth: CellValues, weight: CellValues) -> CellValues:
-    """Mean line integral of the cells that are lit [part of the rows, broad column]."""
+    """Mean line integral [part of the rows, broad column] of the cells with beam."""
     lit = (weight > 0).astype(np.float32)
     sums, lit = (sums_of_places(each, min(PARTS, depth.shape[0]), COLUMNS) for each in (depth, lit))
     return np.asarray(sums / np.maximum(lit, 1), np.float32)
@@ -226,7 +225,7 @@ def _noise(profiles: tuple[CellValues, ...], stride: int) -> float:
 
 
 def _designed(rim: float, stride: int, noise: float, limit: float) -> Filters:
-    """The filters for a sample whose rim moves `rim` broad columns a view."""
+    """The filters for a sample whose rim moves `rim` broad columns per projection."""
     views, cols = window(LAGS)
     signals, speeds = [], []
     for width in WIDTHS:
