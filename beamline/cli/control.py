@@ -357,5 +357,5 @@ def _read_devices(config: Config, as_json: bool, sink: Sink) -> None:
                 )
                 click.echo(f"{state.name:<14}{sentence}")
     if silent:
-        advice = "The lines above say what to do for each device. Nothing has moved"
+        advice = "Nothing has moved. The lines above say what to do for each device"
         raise DeviceError("devices", f"{' and '.join(silent)} cannot be used", advice=advice)

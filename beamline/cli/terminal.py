@@ -217,6 +217,7 @@ def rate_text(done: Counted | PhaseReached, what: str = "frames") -> str:
     """n/N, rate and remaining time if they are known; otherwise `started`."""
     if not (done.of and done.per_s) or done.eta_s is None:
         return "started"
+    what = "projections" if what == "views" else what
     return f"{done.n}/{done.of}  {done.per_s:.1f} {what}/s  {timedelta(seconds=round(done.eta_s))} left"
 
 

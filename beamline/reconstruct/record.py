@@ -76,7 +76,7 @@ def write_result(
         DataError: the volume could not be written; none is left. A report that fails is a warning.
     """
     phases, ordinary = context.phases, prepared.centred
-    phases.enter("measuring the volume")
+    phases.enter("checking the volume")
     checked = check_volume(made, ordinary, truth, target, context, sink, clock)
     remarks = [*checked.warnings, *([checked.skipped_text] if checked.skipped_text else [])]
     context = replace(context, warnings=remarks)

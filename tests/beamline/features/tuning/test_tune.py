@@ -85,7 +85,7 @@ def test_a_saturated_exposure_gives_way_to_a_shorter_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("dark", "flat", "said"), [(1.0, 1.0, "no beam"), (0.8, 1.0, "there is light"), (0, 0, "no beam")]
+    ("dark", "flat", "said"), [(1.0, 1.0, "no beam"), (0.8, 1.0, "exposed to the beam"), (0, 0, "no beam")]
 )
 def test_no_exposure_is_advised_where_the_shutter_is_at_fault(dark: float, flat: float, said: str) -> None:
     rng = np.random.default_rng(5)
