@@ -193,7 +193,8 @@ class AreaDetectorCamera:
             if lost:
                 raise DeviceError(
                     self.name, f"the ring of {self._ring_size} frames was overrun and {lost} frames are lost",
-                    advice="Take frames faster, trigger slower, or raise ring_mb", state="Later frames can be taken",
+                    advice="Read the frames faster, trigger more slowly, or increase ring_mb",
+                state="Later frames can be taken",
                 )  # fmt: skip
             if self._ring:
                 return self._ring.popleft()
@@ -311,17 +312,17 @@ class AreaDetectorCamera:
                 self._fail(f"its frames cannot be taken: {why}")
             case Died(code):
                 self._fail(
-                    f"the process that receives its frames has ended ({code}), and another one is started",
+                    f"the process that receives its frames has ended ({code}), and a new one is started",
                     state="Frames taken before are good",
                 )
             case Disconnected():
-                advice = "Look whether it runs; it goes on when it is back"
+                advice = "Check that it is running; the scan continues when it is back"
                 self._fail("its IOC has gone", advice, "Frames taken before are good")
             case ArrayFrame(is_current=False):
                 self._take_frame(item)
 
     def _fail(
-        self, problem: str, advice: str = "", state: str = "It is still armed, and frames taken before are good"
+        self, problem: str, advice: str = "", state: str = "It is still armed, and earlier frames are good"
     ) -> None:
         self._problem = DeviceError(self.name, problem, advice=advice, state=state)
 

@@ -86,9 +86,11 @@ class Counters:
         if dropped:
             return f"by the plugin {self.plugin.prefix}, whose queue was full (DroppedArrays rose by {dropped:.0f})"
         if counted is None:
-            return "before they came here: no counter of the IOC tells where"
+            return "before they arrived here; no counter of the IOC shows where"
         if counted > len(gap.ids):
-            return "between the plugin, which sent them, and here: the network, or the server's queue for us"
+            return (
+                "between the plugin, which sent them, and this computer: in the network, or in the queue of the server"
+            )
         return f"before the plugin {self.plugin.prefix}: by the camera or its driver"
 
 
@@ -102,7 +104,9 @@ def losses_told(gaps: Sequence[Gap], overflowed: Collection[int], counters: Coun
     for gap in gaps:
         for i in gap.ids:
             if i in overflowed:
-                cause = f"by {OURS}, whose memory for waiting frames was full: the disk is too slow (ride.ring_mb)"
+                cause = (
+                    f"by {OURS}, because its memory for waiting frames was full: the disk is too slow (ride.ring_mb)"
+                )
             elif gap.still > _LONG:
                 cause = f"by {OURS}, which stood still for {gap.still:.1f} s (ride.queue_s)"
             else:
@@ -173,8 +177,8 @@ def refuse_mistakes(config: RideConfig, counters: Counters, frame: ArrayFrame | 
     plugin, seconds = counters.plugin.prefix, counters.plugin.number("MinCallbackTime_RBV")
     if seconds:
         raise ConfigError(
-            f"{plugin}MinCallbackTime is {seconds:g} s: frames that come sooner are skipped without a word. Set it to "
-            f"0. {_SKIPPED}"
+            f"{plugin}MinCallbackTime is {seconds:g} s: frames that come sooner are skipped, and no error is reported. "
+            f"Set it to 0. {_SKIPPED}"
         )
     _refuse_port(config.ride.source, counters)
     if frame is not None:

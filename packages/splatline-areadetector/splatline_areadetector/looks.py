@@ -23,7 +23,7 @@ def check(config: RideConfig) -> list[str]:
         rows = {
             "image": stream.name,
             "frames": _size(frames[-1] if frames else stream.first),
-            "port": counters.plugin.text("NDArrayPort_RBV") or "not told: no variables of the plugin answer",
+            "port": counters.plugin.text("NDArrayPort_RBV") or "not known: the variables of the plugin do not answer",
             "queue": f"{stream.queue} frames in the server",
             "arrival": _arrival(frames) or f"no frame in {SECONDS:g} s: {silence_told(counters)}",
             "refused": refused,

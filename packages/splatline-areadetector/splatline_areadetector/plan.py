@@ -81,9 +81,11 @@ def timeline_of(plan: RidePlan, shape: tuple[int, int], preview_bin: int, free: 
     n_frames = sum(block.n for block in blocks)
     frame_bytes = 2 * math.prod(shape)
     total = n_frames * (frame_bytes + 4 * math.prod(preview_shape(shape, preview_bin)))
-    remarks = ["the scan is another program's: it is neither paused nor repeated, and no device is operated"]
+    remarks = ["another program runs the scan: this command cannot pause or repeat it, and operates no device"]
     if total > free:
-        remarks.append(f"the scan needs {size(total)}, the disk has {size(free)} free: free some while it runs")
+        remarks.append(
+            f"the scan needs {size(total)}, but the disk has {size(free)} free. Free some space during the scan"
+        )
     return Timeline(blocks, n_frames * period, frame_bytes, total, 0, 0.0, 0.0, 0.0, (), tuple(remarks), _plan_of(plan))
 
 

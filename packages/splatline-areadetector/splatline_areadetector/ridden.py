@@ -64,7 +64,7 @@ class EpochEndedError(LedgerError):
 def outside_sentence(guide: Guide) -> str:
     """What is said of frames of no scan."""
     status = f" ({guide.status})" if guide.status else ""
-    return f"Frames of no scan come{status}: they are not stored."
+    return f"Frames arrive that do not belong to a scan{status}. They are not stored."
 
 
 class RiddenFrames:
@@ -138,9 +138,9 @@ class RiddenFrames:
                     self._silence.look()
                 case Disconnected():
                     self._gone = True
-                    self._warn(f"{self._stream.name}: its server has gone. The ride waits for it.")
+                    self._warn(f"{self._stream.name}: the server is gone. Waiting until it is back.")
                 case Died(code):
-                    self._warn(f"The process that receives frames has ended ({code}): another one is started.")
+                    self._warn(f"The process that receives frames has ended ({code}); a new one is started.")
                 case Overflow(unique_id):
                     self._overflowed.add(unique_id)
                     yield from self._stored(self._sorter.decided(1))
@@ -148,8 +148,8 @@ class RiddenFrames:
                         self._gaps.append(Gap(lost, self._last.time, self._last.time))
                 case Refused(unique_id, why):
                     raise DataError(
-                        f"Frame {unique_id} of {self._stream.name} cannot be stored: {why}. What came before is in "
-                        "the file."
+                        f"Frame {unique_id} of {self._stream.name} cannot be stored: {why}. Earlier frames are in the "
+                        "file."
                     )
                 case ArrayFrame():
                     if item.is_current and self._arrived is not None and item.time <= self._arrived.time:
@@ -216,7 +216,8 @@ class RiddenFrames:
     def _cannot_use(self, frame: ArrayFrame, why: str) -> None:
         if why not in self._unused:
             self._warn(
-                f"Frame {frame.unique_id}: {why}. It counts as missing; of others like it this is said at the end."
+                f"Frame {frame.unique_id}: {why}. It counts as missing. Other frames of this kind are listed at the "
+                "end."
             )
         self._unused.setdefault(why, []).append(frame.unique_id)
 
@@ -257,7 +258,7 @@ class RiddenFrames:
             if math.isnan(angle):
                 kind = FrameKind.INVALID
                 self._sorter.lose(place)
-                self._cannot_use(frame, f"{self._guide.unknown_angle}, so that it is kept as an invalid row")
+                self._cannot_use(frame, f"{self._guide.unknown_angle}, so it is stored as an invalid row")
             else:
                 self._views += 1
         seconds = seconds_of(frame.attributes.get(EXPOSURE)) or self._plan.exposure(place.kind)
@@ -287,7 +288,7 @@ class RiddenFrames:
     def _refuse_pause(self) -> None:
         reason = self._measurement.pause.reason
         if reason and reason != self._told_pause:
-            self._warn(f"The scan is another program's, and goes on: it should pause, as {reason}.")
+            self._warn(f"Pause the scan in the program that runs it, because {reason}. This command cannot pause it.")
         self._told_pause = reason
         self._measurement.pause.resume()
 
@@ -309,7 +310,7 @@ class RiddenFrames:
                 words.append(f"{len(missing)} of {block.n} {noun}s {are} missing: {spans(missing)}{at}.")
         words.append(self._first_or_last(ended))
         for why, ids in self._unused.items():
-            words.append(f"{count(len(ids), 'frame')} came ({spans(ids)}) but could not be used: {why}.")
+            words.append(f"{count(len(ids), 'frame')} arrived ({spans(ids)}), but could not be used: {why}.")
         if self._unused and self._guide.status:
             words.append(f"Now: {self._guide.status}.")
         words += losses_told(self._gaps, self._overflowed, self._ride.counters)
@@ -353,8 +354,8 @@ class RiddenFrames:
             raise ScanAborted(f"Aborted: {self._stop.reason}.{told}")
         if self._stop.stopping and not self._sorter.complete:
             raise ScanStopped(
-                f"Stopped after {self._views} of {planned} projections: {self._stop.reason}. The file is complete as "
-                f"far as it goes.{told}"
+                f"Stopped after {self._views} of {planned} projections: {self._stop.reason}. The frames so far are in "
+                f"the file.{told}"
             )
         if self._epoch:
             raise EpochEndedError(f"{told.strip()} The file ends there, as {self._epoch}.{self._others}", self.missing)
@@ -364,7 +365,7 @@ class RiddenFrames:
     @property
     def _others(self) -> str:
         if not self._views:
-            return f" The file has {count(self._row, 'frame')}, and no projection with an angle."
+            return f" The file has {count(self._row, 'frame')}, but no projection with an angle."
         by = "" if self._sorter.basis.is_sure else f", counted from {self._sorter.basis.value}"
         return f" Every other frame is in the file with the angle of its number{by}."
 

@@ -129,7 +129,7 @@ def _is_alone(first: ArrayFrame, ride: Ride) -> bool:
         raise ConfigError(f"{not_set(first.unique_id)}. Nothing was recorded.")
     if len(ahead) < 2 or first.kind == ahead[0].kind or ahead[0].kind != ahead[1].kind:
         return False
-    ride.say(f"Frame {first.unique_id} is of another size than those after it: it is not stored.")
+    ride.say(f"Frame {first.unique_id} is not stored, because the frames after it have another size.")
     return True
 
 
@@ -140,7 +140,10 @@ def _shown(ride: Ride) -> str:
         return "."
     untold = not isinstance(ride.config.ride.angles, TomoscanAngles) and _exposure(ride, None, first) is None
     return f" ({first.window.shape[0]} x {first.window.shape[1]} {first.dtype})." + (
-        f" Nothing tells the exposure yet: its frames must have the attribute {EXPOSURE}, else set ride.exposure_s."
+        (
+            f" The exposure is not known yet: the frames must have the attribute {EXPOSURE}, otherwise set "
+            "ride.exposure_s."
+        )
         if untold
         else ""
     )
@@ -158,8 +161,8 @@ def _with_exposure(plan: RidePlan, ride: Ride, first: ArrayFrame) -> RidePlan:
     seconds = _exposure(ride, plan.exposures.get(FrameKind.PROJECTION), first)
     if seconds is None:
         raise ConfigError(
-            f"Nothing tells the exposure: the frames have no attribute {EXPOSURE}, and ride.camera names no camera. "
-            "Set ride.exposure_s. Nothing was recorded."
+            f"Set ride.exposure_s, because the exposure is not known: the frames have no attribute {EXPOSURE}, and "
+            "ride.camera names no camera. Nothing was recorded."
         )
     camera = ride.counters.camera
     period = plan.period or (None if camera is None else seconds_of(camera.number("AcquirePeriod_RBV")))
@@ -172,7 +175,7 @@ def _with_given(plan: RidePlan, given: Images, shape: tuple[int, int]) -> RidePl
         if images.shape[1:] != shape:
             raise ConfigError(
                 f"--{kind.name.lower()}s has frames of {images.shape[1]} x {images.shape[2]} pixels, the camera of "
-                f"{shape[0]} x {shape[1]}: give those of this region and binning. Nothing was recorded."
+                f"{shape[0]} x {shape[1]}: use frames with the region and binning of this scan. Nothing was recorded."
             )
     blocks = tuple(PlannedBlock(kind, len(images)) for kind, images in given.items())
     return replace(plan, blocks=(*blocks, *plan.blocks))
@@ -191,7 +194,7 @@ def load_given(darks: str | None, flats: str | None) -> Images:
         counts = np.rint(images)  # means of others' frames are real numbers
         if not (images.size and counts.min() >= 0 and counts.max() <= np.iinfo(np.uint16).max):
             raise ConfigError(
-                f"--{kind.name.lower()}s {name} has no counts: they are numbers from 0 to 65535. Nothing was recorded."
+                f"--{kind.name.lower()}s {name} has values that are not counts (0 to 65535). Nothing was recorded."
             )
         given[kind] = counts.astype(np.uint16)
     return given

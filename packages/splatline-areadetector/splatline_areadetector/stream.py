@@ -200,10 +200,10 @@ class FrameStream:
                 self.name,
                 f"no answer within {within:g} s",
                 advice=UNREACHABLE,
-                state="It was only asked, and nothing was changed",
+                state="The server was only read, and nothing was changed",
             ) from None
         except RemoteError as error:
-            raise ConfigError(f"{self.name} refuses to be read: {error}. Nothing was started.") from None
+            raise ConfigError(f"{self.name} does not allow reading: {error}. Nothing was started.") from None
 
     def _start(self) -> None:
         """Start a receiver. Ctrl-C does not reach it, and it imports what this process does."""

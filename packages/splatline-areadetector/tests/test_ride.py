@@ -297,7 +297,7 @@ def test_settings_that_are_refused(
         ({"counts": np.zeros((4, 4), np.int16)}, {}, "pixels are int16"),
         ({"codec": {"name": "jpeg", "parameters": 5}}, {}, "compressed by jpeg, which does not keep counts"),
         ({}, {"kinds": "HDF5FrameLocation"}, "HDF5FrameLocation, an attribute that the frames do not have; they have"),
-        ({}, {"exposure_s": None}, "Nothing tells the exposure"),
+        ({}, {"exposure_s": None}, "the exposure is not known"),
     ],
 )
 def test_frames_that_are_refused(tmp_path: Path, value: dict[str, Any], ride: dict[str, Any], sentence: str) -> None:
@@ -313,7 +313,7 @@ def test_a_camera_that_tells_no_exposure_time_tells_none(tmp_path: Path) -> None
         ioc.put({"cam1:AcquireTime_RBV": 0.0})
         config = config_of(tmp_path, ioc.url, camera="pva://T:cam1:", exposure_s=None)
         told = ride_along(config, tmp_path, lambda stop: ioc.send(range(1, 3)))
-    assert "Nothing tells the exposure" in str(told.error) and not stored(tmp_path)
+    assert "the exposure is not known" in str(told.error) and not stored(tmp_path)
 
 
 def test_a_binned_stream_is_refused_unless_it_is_named(tmp_path: Path) -> None:

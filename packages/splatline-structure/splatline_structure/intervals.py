@@ -34,11 +34,12 @@ WIDEST, NARROWEST = 0.5, 0.001  # of the value: a wider interval determines no n
 CAUSES = {
     "views": "more views would narrow this",
     "levels": "the threshold decides this, not the views",
-    "voxels": "the size of a voxel decides this, not the views",
-    "particles": "more whole particles would narrow this: a larger field",
+    "voxels": ("the interval is this wide because of the voxel size, not because of the projections"),
+    "particles": ("a larger field of view with more complete particles would narrow the interval"),
 }
 _NO_CAUSE = (
-    f"no cause changes this number; the interval is the narrowest that is given ({100 * NARROWEST:g} % to a side)"
+    f"none of the causes of error changes this number, so the narrowest interval is given ({100 * NARROWEST:g} "
+    "% to a side)"
 )
 _SHARES = "fraction", "sphericity", "cracks", "connected"
 
@@ -131,7 +132,10 @@ def found_in(
         try:
             thresholds = materials_of(part, count).thresholds
         except ValueError:
-            why = "half of the views show no contrast between the materials: more views or photons are needed"
+            why = (
+                "with half of the projections the materials cannot be distinguished: more projections or photons are "
+                "needed"
+            )
             thresholds = materials.thresholds
         moved.append(float(np.abs((thresholds - materials.thresholds) / gaps).max()))
         halves.append(structure_of(part, thresholds, spacing, rules))
@@ -148,7 +152,7 @@ def found_in(
     unsure = probabilities(volume, materials.thresholds, float(materials.spread.max())).max(axis=0) < SURE
     undecided = float(unsure.mean())
     if undecided > UNDECIDED:
-        why = f"{undecided:.0%} of the voxels could be of either material: more views or photons are needed"
+        why = f"{undecided:.0%} of the voxels could be either material: more projections or photons are needed"
     intervals = {
         name: Interval(value, why_not=why)
         if why
@@ -192,12 +196,20 @@ def _interval(
 ) -> Interval:
     kind = name.split("_")[0]
     if not math.isfinite(value):
-        nothing = "nothing connects the faces" if math.isinf(value) else "there is no whole particle in the field"
+        nothing = (
+            "nothing connects the faces" if math.isinf(value) else "no particle is completely inside the field of view"
+        )
         return Interval(value, why_not=nothing if kind != "connected" else "there is none of the material")
     if of_particles == math.inf:
-        return Interval(value, why_not="only one particle is whole, which has no distribution of sizes")
+        return Interval(value, why_not="only one particle is complete, so there is no distribution of sizes")
     if not all(map(math.isfinite, (*halves, *sides, wide))):
-        return Interval(value, why_not="it is there or not by the threshold, half of the views, or the voxels")
+        return Interval(
+            value,
+            why_not=(
+                "it exists or not depending on the threshold, on which half of the projections is used, or on the "
+                "voxel size"
+            ),
+        )
     still, of_voxels = OF_KIND.get(kind, OTHERS) if cubes else (OF_KIND.get(kind, OTHERS)[0], OTHERS[1])
     change = value - float(np.mean(halves)) if halves else math.nan
     moves, views = still * change, math.hypot(BIAS_UNSURE * change, NOISE * float(np.ptp(halves or [0.0])) / 2)

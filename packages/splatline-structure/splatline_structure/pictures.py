@@ -18,7 +18,7 @@ from splatline_structure.volumes import ReadSlices
 
 def pictures_of(found: Found, volume: F32, grid: Grid, read: ReadSlices) -> list[Picture]:
     """All pictures of a page; of sizes only where a particle is whole."""
-    with_band = ", halves of the views as a band" if found.parts else ""
+    with_band = ", the halves of the projections as a band" if found.parts else ""
     shown = [
         Picture(
             "Materials",
@@ -30,7 +30,7 @@ def pictures_of(found: Found, volume: F32, grid: Grid, read: ReadSlices) -> list
         shown.append(
             Picture(
                 "Sizes",
-                f"Share of the volume of whole particles below a diameter{with_band}; lines: intervals of the sizes.",
+                f"Volume fraction of complete particles below a diameter{with_band}; lines: intervals of the sizes.",
                 sizes(found),
             )
         )
@@ -42,7 +42,9 @@ def pictures_of(found: Found, volume: F32, grid: Grid, read: ReadSlices) -> list
             profiles(found, grid, read),
         ),
         Picture(
-            "What decides", "Half-width of the interval of each number that is determined.", causes(found.intervals)
+            "What decides",
+            "Half-width of the interval, for each number that could be determined.",
+            causes(found.intervals),
         ),
     ]
 

@@ -99,8 +99,8 @@ def study_structure(
             record = reconstruct(scan, method, views=f"fixed:{n}", selection=Selection(axis_col=axis_col), say=None)
             if record.length_unit != "mm":
                 raise DataError(
-                    f"{scan} does not state the size of a pixel: `beamline ingest {scan} COPY.h5 --pixel-size-um SIZE` "
-                    "makes a copy that does. Nothing was written."
+                    f"{scan} does not state the pixel size. `beamline ingest {scan} COPY.h5 --pixel-size-um SIZE` "
+                    "makes a copy that states it. Nothing was written."
                 )
             axis_col = record.axis_col
             try:
@@ -109,10 +109,16 @@ def study_structure(
                 read = ReadSlices(record, slices, slices, slices.stop)
                 series[n] = measured(scan, read, box, answer, **values).found.intervals
             except ValueError as error:
-                raise DataError(f"{n} views of {scan} cannot be measured: {error}. Nothing was written.") from error
+                raise DataError(
+                    f"{n} projections of {scan} cannot be evaluated: {error}. Nothing was written."
+                ) from error
         rows = [[str(n), *results.cells(name, series[n][name])] for n in views for name in names]
         curves = pictures.curves_of({name: [series[n][name] for n in views] for name in names}, views, "views")
-        shown = [Picture("Numbers against views", "Values with their intervals; gaps are not determined.", curves)]
+        shown = [
+            Picture(
+                "Numbers against views", "Values with their intervals. Gaps: the value could not be determined.", curves
+            )
+        ]
         table = {f"{row[1]}, {row[0]} views": series[int(row[0])][row[1]] for row in rows}
         page = results.page(f"Structure of {scan.name} against views", method, [], shown, table, {"scan": scan})
         with atomic_file(output) as folder:

@@ -90,15 +90,15 @@ def read_volume(
             unpacked = sum(each.file_size for each in packed.infolist())
         if unpacked > memory:
             raise DataError(
-                f"{path} unpacks to {size(unpacked)}, and {size(memory)} may be used: give more --memory, or save the "
+                f"{path} unpacks to {size(unpacked)}, but {size(memory)} is allowed. Use more --memory, or save the "
                 "volume as .npy (numpy.save), which is read slice by slice. Nothing was written."
             )
     with opened_volume(path, dataset) as record:
         grid = record.volume.grid
         if voxel_um is None and record.length_unit != "mm":
             raise DataError(
-                f"{path} does not state the size of a voxel: give --voxel-um EDGE, or Z:Y:X if voxels are not cubes. "
-                "Nothing was written."
+                f"{path} does not state the voxel size. Add --voxel-um EDGE, or Z:Y:X if voxels are not cubes. Nothing "
+                "was written."
             )
         if voxel_um is not None:
             if record.length_unit == "mm" and not np.allclose(voxel_um, stated := 1e3 * np.array(grid.spacing), 0.01):
@@ -117,17 +117,17 @@ def read_volume(
         if most < least:
             needed = rounded((bytes_a_voxel * least + BYTES_BESIDE) * math.prod(grid.shape[1:]), up=True)
             raise DataError(
-                f"{path}: {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels take {size(needed)}, and "
-                f"{size(memory)} may be used{' for each of several volumes' if whole else ''}. Free memory, give more "
+                f"{path}: {least} slices of {grid.shape[1]} x {grid.shape[2]} voxels need {size(needed)}, but "
+                f"{size(memory)} is allowed{' for each of several volumes' if whole else ''}. Free memory, use more "
                 f"--memory{', fewer --slices' if whole else ''}{', --crop square' if crop == 'none' else ''}, or "
                 "measure a part of the volume (`recon --roi`, then --parts or --quick). Nothing was written."
             )
         excess = max(end - first - most, 0)
         fitting = slice(first + excess // 2, end - (excess - excess // 2))
         limit_sentence = (
-            f"{size(memory)} of memory hold {most} of {end - first} slices: numbers are of slices "
-            f"{fitting.start}:{fitting.stop}, in the middle, and those named _all of {first}:{end}, with intervals "
-            "as wide as in the middle. Free memory or give more --memory to measure more slices."
+            f"{size(memory)} of memory are enough for {most} of {end - first} slices. Numbers are measured in the "
+            f"middle slices, {fitting.start}:{fitting.stop}; numbers named _all are measured in {first}:{end}, with "
+            "the intervals of the middle slices. Free memory or use more --memory to measure more slices."
             if excess
             else ""
         )
@@ -135,12 +135,12 @@ def read_volume(
         values = np.ascontiguousarray(record.volume.data[fitting], np.float32)
         if min(values.shape) < _LEAST:
             raise DataError(
-                f"{path} holds {values.shape}; expected {_LEAST} or more voxels a side. Nothing was written."
+                f"{path} has the shape {values.shape}; expected at least {_LEAST} voxels a side. Nothing was written."
             )
         if crop != "finite" and (share := 1 - np.isfinite(values).mean()):
             raise DataError(
-                f"{path} has values that are not finite, {share:.2%} of its voxels. If they lie outside the circle of "
-                "the field, --crop finite measures the square inside it. Nothing was written."
+                f"{path} has values that are not finite, {share:.2%} of its voxels. If these are outside the circle of "
+                "the field of view, use --crop finite: it measures the square inside the circle. Nothing was written."
             )
         record = replace(record, volume=Volume(values, grid), length_unit="mm", deviation=None, series=None)
         return ReadSlices(record, fitting, slice(first, end), n_slices, limit_sentence)
@@ -192,7 +192,7 @@ def box_in(volume: F32, crop: Crop) -> Box:
     if crop == "finite" and not known.all():
         box = inscribed_box((nz, ny, nx), sample_circle(known[None].astype(np.float32)), 0.0)
         if not known[box[1:]].all():
-            raise ValueError("it has values that are not finite, and they are not those outside a circle")
+            raise ValueError("it has values that are not finite, also inside the circle")
         return box
     y, x = (np.arange(n) - (n - 1) / 2 for n in (ny, nx))
     away, field = np.hypot(y[:, None], x), min(ny, nx) / 2
@@ -243,7 +243,9 @@ def inscribed_box(shape: tuple[int, int, int], circle: tuple[float, float, float
         for c, n in zip(centre, shape[1:], strict=True)
     )
     if y.start >= y.stop or x.start >= x.stop:
-        raise ValueError(f"the square in a circle of radius {radius:.3g} voxels at {centre} holds no voxel of {shape}")
+        raise ValueError(
+            f"the square in a circle of radius {radius:.3g} voxels at {centre} contains no voxel of {shape}"
+        )
     return slice(0, shape[0]), y, x
 
 
@@ -261,7 +263,10 @@ def parts_of(
     """
     record, facts, at = read.record, read.record.parameters, read.slices
     if math.isnan(record.axis_col):
-        raise ValueError("it does not state the axis of its scan, about which halves are made: give --parts or --quick")
+        raise ValueError(
+            "it does not state the rotation axis of its scan, which is needed to reconstruct the halves: use --parts "
+            "or --quick"
+        )
     rows: Any = None if facts.get("rows", "all") == "all" else tuple(map(int, str(facts["rows"]).split(":")))
     selection = Selection(
         views=str(facts.get("views", "all")), rows=rows, binning=int(facts.get("binning", 1)), axis_col=record.axis_col,
@@ -273,14 +278,15 @@ def parts_of(
             if (end - first) // side != read.n_slices:
                 raise ValueError(
                     f"the volume has {read.n_slices} slices, but rows {first}:{end} of its scan give "
-                    f"{(end - first) // side}: give --parts or --quick"
+                    f"{(end - first) // side}: use --parts or --quick"
                 )
             low, high = max(at.start - _BESIDE, 0), min(at.stop + _BESIDE, read.n_slices)
             selection = replace(selection, rows=(first + low * side, first + high * side))
             at = slice(at.start - low, at.stop - low)
         elif read.limit_sentence:
             raise ValueError(
-                "halves of a cone's views are reconstructed whole, which memory does not hold: give --quick or --parts"
+                "in a cone beam the halves must be reconstructed completely, but the memory is too small: use --quick "
+                "or --parts"
             )
         prepared = prepare_projections(source, selection, warn)
     views, order = prepared.views, np.argsort(np.mod(prepared.geometry.angles, prepared.geometry.period), kind="stable")

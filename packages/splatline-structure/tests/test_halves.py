@@ -90,7 +90,7 @@ def test_thirty_views_of_a_thousand_photons_across_256_columns_determine_nothing
         for part in (views, views[::2], views[1::2])
     ]
     intervals = found_in(of_views[0], of_views[1:], 2, (1, 1, 1), replace(RULES, side=0)).intervals
-    assert all("more views or photons" in each.why_not for each in intervals.values())
+    assert all("more projections or photons" in each.why_not for each in intervals.values())
 
 
 @pytest.mark.slow
@@ -158,7 +158,7 @@ def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(her
     np.save(here / "v.npy", np.random.default_rng(0).random((10, 48, 48), np.float32))
     read = read_volume(here / "v.npy", None, (2, 2, 2), None, 10**9, "square")
     read = replace(read, record=replace(read.record, parameters={"axis_col": 23.5}))
-    with pytest.raises(ValueError, match=r"has 10 slices, but rows 0:16 of its scan give 16: give --parts or --quick"):
+    with pytest.raises(ValueError, match=r"has 10 slices, but rows 0:16 of its scan give 16: use --parts or --quick"):
         parts_of(read, here / "scan.h5", 2, pytest.fail, lambda *_: None)
 
 

@@ -53,10 +53,10 @@ def test_a_volume_gets_a_folder_of_numbers_particles_labels_and_a_page(here: Pat
     rows = {row["number"]: row for row in _rows(here / "can_structure/numbers.csv")}
     size = rows["size_50"]
     assert float(size["low"]) < float(size["value"]) < float(size["high"]) and size["unit"] == "µm"
-    assert size["decides"] == "more whole particles would narrow this: a larger field"  # of six balls
+    assert size["decides"] == "a larger field of view with more complete particles"  # of six balls
     assert rows["fraction_2"]["decides"] in (
         "the threshold decides this, not the views",
-        "the size of a voxel decides this, not the views",
+        "because of the voxel size, not because of the projections",
     )
     assert facts["numbers"]["fraction_2"]["value"] == pytest.approx(float(rows["fraction_2"]["value"]), rel=1e-3)
     particles = _rows(here / "can_structure/particles.csv")
@@ -187,7 +187,7 @@ def test_few_photons_determine_nothing(here: Path) -> None:
     np.save(here / "noisy.npy", (blobs + rng.normal(0, 0.33, blobs.shape)).astype(np.float32))
     result = beamline("structure", "noisy.npy", *VOXEL_UM, "--quick", "--side", "0", "--crop", "none")
     assert result.exit_code == 0, result.output
-    assert "not determined" in result.stdout and "could be of either material" in result.stdout
+    assert "not determined" in result.stdout and "could be either material" in result.stdout
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -199,7 +199,7 @@ def test_of_a_volume_larger_than_the_memory_the_middle_is_looked_at_and_all_for_
     common = ("structure", "can.npy", *VOXEL_UM, "--side", "0", "--parts", "half.npy", "half.npy")
     result = beamline(*common, "--memory", "13.3M", "-o", "part")
     assert result.exit_code == 0, result.output
-    words = "13.3 MB of memory hold 17 of 40 slices: numbers are of slices 11:28, in the middle"
+    words = "13.3 MB of memory are enough for 17 of 40 slices. Numbers are measured in the middle slices, 11:28"
     assert words in result.stderr and words in result.stdout
     assert words in (here / "part/report.html").read_text(encoding="utf-8")
     rows = {row["number"]: row for row in _rows(here / "part/numbers.csv")}
@@ -251,13 +251,13 @@ print(peaks[1] - peaks[0])
 REFUSED = [
     (("even.npy", *VOXEL_UM), 5, "even.npy cannot be measured"),
     (("noise.npy", *VOXEL_UM), 5, "near the rarer one; reconstruct from more views. Nothing"),
-    (("can.npy",), 5, "does not state the size of a voxel: give --voxel-um"),
+    (("can.npy",), 5, "does not state the voxel size. Add --voxel-um"),
     (("can.npy", "--voxel-um", "nan"), 2, "expected the edge of a voxel in µm"),
     (("can.npy", "--voxel-um", "3:2:1"), 2, "pixels of a slice are squares"),
     (("labels.npy", *VOXEL_UM, "--materials", "2"), 5, "which are labels, not grey values"),
     (("big.npz", *VOXEL_UM, "--memory", "10K"), 5, "unpacks to 830 kB, and 10 kB may be used"),
     (("holes.npy", *VOXEL_UM), 5, "values that are not finite"),
-    (("small.npy", *VOXEL_UM), 5, "expected 8 or more voxels a side"),
+    (("small.npy", *VOXEL_UM), 5, "expected at least 8 voxels a side"),
     (("can.npy", *VOXEL_UM, "--slices", "3", "99"), 5, "has slices 0 to 40"),
     (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "8 slices of 72 x 72 voxels take 9.75 MB, and 4 MB may be used"),
     (("can.npy", *VOXEL_UM, "--memory", "some"), 2, "'some' is not a size"),
@@ -298,7 +298,10 @@ def test_a_particle_larger_than_the_field_and_no_path_are_words(here: Path) -> N
     np.save(here / "plate.npy", volume.astype(np.float32))
     result = beamline("structure", "plate.npy", *VOXEL_UM, "--quick", "--crop", "none", "--side", "20")
     assert result.exit_code == 0, result.output
-    assert "there is no whole particle in the field" in result.stdout and "nothing connects the faces" in result.stdout
+    assert (
+        "no particle is completely inside the field of view" in result.stdout
+        and "nothing connects the faces" in result.stdout
+    )
 
 
 @pytest.mark.usefixtures("undrawn")

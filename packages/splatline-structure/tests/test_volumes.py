@@ -47,7 +47,7 @@ def test_slabs_of_a_volume_larger_than_the_memory_are_all_slices_and_are_counted
     read = read_volume(path, None, (10, 10, 10), slices, 13_300_000, "square")
     first, end = slices or (0, 40)
     assert (read.slices, read.asked, read.n_slices) == (read_slices, slice(first, end), 40)
-    assert "Free memory or give more --memory to measure more slices." in read.limit_sentence
+    assert "Free memory or use more --memory to measure more slices." in read.limit_sentence
     box = box_in(read.record.volume.data, "square")
     slabs = list(slabs_of(path, None, read, box, lambda n, of: counted.append((n, of))))
     own = [slabs[0], *(slab[1:] for slab in slabs[1:])]
@@ -88,6 +88,6 @@ def test_a_volume_that_is_not_finite_outside_a_circle_is_measured_inside_it(tmp_
     box = box_in(read.record.volume.data, "finite")
     assert np.isfinite(volume[box]).all() and box[1] == box[2] and box[1].stop - box[1].start in range(47, 52)
     volume[3, 36, 36] = np.inf
-    with pytest.raises(ValueError, match="not those outside a circle"):
+    with pytest.raises(ValueError, match="also inside the circle"):
         box_in(volume, "finite")
     np.testing.assert_equal(box_in(np.nan_to_num(volume), "finite"), box_in(np.nan_to_num(volume), "square"))

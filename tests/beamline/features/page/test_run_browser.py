@@ -203,4 +203,4 @@ def test_no_run_is_no_error_and_no_folder_is_one(tmp_path: Path, monkeypatch: py
     assert result.exit_code == 2 and "the folder runs does not exist" in result.stderr
     (tmp_path / "runs").mkdir()
     result = beamline("runs")
-    assert (result.exit_code, result.stdout) == (0, "") and "no run in runs" in result.stderr
+    assert (result.exit_code, result.stdout) == (0, "") and "no runs in runs" in result.stderr
