@@ -93,7 +93,7 @@ def test_tomoscan_tells_kinds_and_angles(tmp_path: Path, restarted: bool) -> Non
         file.ids, [*range(1, 4), *range(1, 5), *range(1, 9), *range(1, 5)] if restarted else range(101, 120)
     )
     assert np.allclose(file.seconds, np.where(file.kinds == 0, 0.03, 0.01))
-    assert any("of no scan" in text for text in told.before)
+    assert any("do not belong to a scan" in text for text in told.before)
 
 
 @pytest.mark.parametrize("first_id", [None, 100])
@@ -196,7 +196,7 @@ def test_lost_frames_are_named_with_whose_loss_it_was(tmp_path: Path) -> None:
     text = str(told.error)
     assert "4 of 20 projections are missing: 4-5, 10, 14 (from 36° to 126°)." in text
     assert "Frames 5-6 were lost by the plugin T:Pva1:, whose queue was full (DroppedArrays rose by 2)." in text
-    assert "Frame 11 was lost between the plugin, which sent them, and here" in text
+    assert "Frame 11 was lost between the plugin, which sent them, and this computer" in text
     assert "Frame 15 was lost before the plugin T:Pva1:: by the camera or its driver." in text
     (file,) = stored(tmp_path)
     assert file.missing == [4, 5, 10, 14] and np.allclose(file.degrees, 9.0 * (file.ids - 1))

@@ -165,9 +165,8 @@ def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(her
 def test_halves_of_a_volume_without_an_axis_are_refused_with_a_way_out(here: Path) -> None:
     np.save(here / "v.npy", np.random.default_rng(0).random((16, 48, 48), np.float32))
     result = beamline("structure", "v.npy", "--voxel-um", "2", "--scan", "scan.h5")
-    words = (
-        "v.npy cannot be measured: it does not state the axis of its scan, about which halves are made: give --parts"
-    )
+    words = "v.npy cannot be measured: it does not state the rotation axis of its scan, which is needed to reconstruct "
+        "the halves: use --parts"
     assert result.exit_code == 5 and words in result.stderr
     assert left(here) == {"scan.h5", "v.npy"}
 
@@ -176,7 +175,7 @@ def test_halves_of_a_volume_without_an_axis_are_refused_with_a_way_out(here: Pat
 def test_views_that_cannot_be_parted_are_refused(here: Path, views: str) -> None:
     result = beamline("study", "structure", "scan.h5", "--views", views)
     assert result.exit_code == 2
-    assert f"'{views}': expected numbers such as 45,90,180, of 16 views or more" in result.stderr
+    assert f"'{views}': expected numbers such as 45,90,180, each at least 16" in result.stderr
     assert left(here) == {"scan.h5"}
 
 

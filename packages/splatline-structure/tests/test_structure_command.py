@@ -135,8 +135,8 @@ def test_several_volumes_of_which_memory_does_not_hold_one_are_refused_before_an
     result = beamline("structure", "short.npy", "can.npy", *VOXEL_UM, *options, "--memory", "13.3M")
     assert result.exit_code == 5
     assert (
-        "can.npy: 40 slices of 72 x 72 voxels take 22.2 MB, and 13.3 MB may be used for each of several volumes. "
-        "Free memory, give more --memory, fewer --slices, or measure a part" in result.stderr
+        "can.npy: 40 slices of 72 x 72 voxels need 22.2 MB, but 13.3 MB is allowed for each of several volumes. "
+        "Free memory, use more --memory, fewer --slices, or measure a part" in result.stderr
     )
     result = beamline("structure", "can.npy", "can.npy", *VOXEL_UM, *options, "--memory", "13.3M", "--crop", "none")
     assert "fewer --slices, --crop square, or" in result.stderr and left(here) == before
@@ -255,13 +255,13 @@ REFUSED = [
     (("can.npy", "--voxel-um", "nan"), 2, "expected the edge of a voxel in µm"),
     (("can.npy", "--voxel-um", "3:2:1"), 2, "pixels of a slice are squares"),
     (("labels.npy", *VOXEL_UM, "--materials", "2"), 5, "which are labels, not grey values"),
-    (("big.npz", *VOXEL_UM, "--memory", "10K"), 5, "unpacks to 830 kB, and 10 kB may be used"),
+    (("big.npz", *VOXEL_UM, "--memory", "10K"), 5, "unpacks to 830 kB, but 10 kB is allowed"),
     (("holes.npy", *VOXEL_UM), 5, "values that are not finite"),
     (("small.npy", *VOXEL_UM), 5, "expected at least 8 voxels a side"),
     (("can.npy", *VOXEL_UM, "--slices", "3", "99"), 5, "has slices 0 to 40"),
-    (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "8 slices of 72 x 72 voxels take 9.75 MB, and 4 MB may be used"),
+    (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "8 slices of 72 x 72 voxels need 9.75 MB, but 4 MB is allowed"),
     (("can.npy", *VOXEL_UM, "--memory", "some"), 2, "'some' is not a size"),
-    (("can.npy", *VOXEL_UM, "--memory", "0.0001K"), 5, "and 0 B may be used"),
+    (("can.npy", *VOXEL_UM, "--memory", "0.0001K"), 5, "but 0 B is allowed"),
     (("can.npy", *VOXEL_UM, "--memory", "4M"), 5, "(`recon --roi`, then --parts or --quick)"),
     (("can.npy", *VOXEL_UM, "--scan", "nosuch.h5"), 2, "'nosuch.h5' does not exist"),
     (("can.npy", *VOXEL_UM, "--particles", "3"), 2, "Material 3 of 2"),
