@@ -165,8 +165,10 @@ def test_rows_that_do_not_give_the_volumes_slices_are_refused_with_a_way_out(her
 def test_halves_of_a_volume_without_an_axis_are_refused_with_a_way_out(here: Path) -> None:
     np.save(here / "v.npy", np.random.default_rng(0).random((16, 48, 48), np.float32))
     result = beamline("structure", "v.npy", "--voxel-um", "2", "--scan", "scan.h5")
-    words = "v.npy cannot be measured: it does not state the rotation axis of its scan, which is needed to reconstruct "
+    words = (
+        "v.npy cannot be measured: it does not state the rotation axis of its scan, which is needed to reconstruct "
         "the halves: use --parts"
+    )
     assert result.exit_code == 5 and words in result.stderr
     assert left(here) == {"scan.h5", "v.npy"}
 
