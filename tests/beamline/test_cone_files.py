@@ -143,4 +143,4 @@ def test_a_dry_run_knows_a_cone_and_refuses_one_that_no_slab_would_make_fit(
     assert (geometry.sod, geometry.sdd, geometry.axis_col, geometry.pixel_pitch) == (SOD, SDD, AXIS, PITCH)
     for words in (("--dry-run",), ()):
         small = beamline("recon", str(scan), "-o", str(tmp_path / "out.h5"), "--memory", "1M", *words)
-        assert small.exit_code == 5 and "a cone is not made in slabs" in small.stderr
+        assert small.exit_code == 5 and "a cone-beam volume cannot be made in slabs" in small.stderr

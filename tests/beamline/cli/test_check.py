@@ -41,7 +41,7 @@ def test_violations() -> None:
     result = run(DEMO, *broken)
     assert result.exit_code == 2
     assert "is valid" not in result.stdout
-    assert (result.stdout + result.stderr).count("period_s 0.02 is below the camera's least") == 1
+    assert (result.stdout + result.stderr).count("period_s 0.02 is below the camera's minimum of") == 1
     assert "limits are exceeded, nothing was started" in result.stderr
     result = run(DEMO, "--json", *broken)
     assert result.exit_code == 2

@@ -15,4 +15,4 @@ def test_ctrl_z_neither_suspends_nor_stops(capfd: pytest.CaptureFixture[str]) ->
     with stop_signals(stop):
         os.kill(os.getpid(), signal.SIGTSTP)
     assert not stop.stopping
-    assert "`beamline pause` pauses it" in capfd.readouterr().err
+    assert "Use `beamline pause` to pause the scan" in capfd.readouterr().err

@@ -80,7 +80,7 @@ def test_the_commands_say_what_became_of_the_scan(tmp_path: Path, monkeypatch: p
         files.append(RecordFile(runs[1], RunRecord(State.PREPARING)))
         with verbs_taken(runs[1], stop, PauseRequest()):
             result = CliRunner().invoke(main, ["abort"])
-            assert result.exit_code == 2 and "2 scans run in runs: a, b" in result.stderr
+            assert result.exit_code == 2 and "2 scans are running in runs: a, b" in result.stderr
             assert CliRunner().invoke(main, ["abort", str(runs[1])]).exit_code == 0
             assert stop.aborting
     for file in files:
@@ -133,7 +133,7 @@ def test_what_is_measured_next_is_said_only_while_the_scan_asks(
         enter(State.ASKING)
         monkeypatch.setattr("beamline.cli.control._LOOKS", 5)
         twice = CliRunner().invoke(main, ["decide", "retake"])  # as the log has it from before
-        assert twice.exit_code == 2 and "has chosen nothing since" in twice.stderr
+        assert twice.exit_code == 2 and "has made no other choice" in twice.stderr
         enter(State.ASKING)
         other = CliRunner().invoke(main, ["decide", str(run), "offset"])
         assert other.exit_code == 2 and "does not take offset" in other.stderr and "took next: because" in other.stderr

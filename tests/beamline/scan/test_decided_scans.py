@@ -87,14 +87,14 @@ def test_a_scan_ends_when_its_views_are_enough_and_says_why(tmp_path: Path) -> N
     ran.assert_good_file(16, "complete")  # with the flats of the end
     assert [(each["passes"], each.get("dropped", 0)) for each in decisions] == [(1, 0), (2, 0), (3, 3)]
     assert ran.of("frame")[-1].data["n"] == ran.of("frame")[-1].data["of"] == 16
-    run, said = describe(ran.folder), "Ended after pass 3 by the choice `enough` of the program: all that the plan "
+    run, said = describe(ran.folder), "Ended after pass 3 by the choice `enough` of the program: the rest of the plan "
     assert (run.frames, run.planned, run.state) == (16, 19, "done") and run.ended.startswith(said)
     assert "16 of 19" in cells(run)
     with open_scan(ran.folder / "scan.h5") as source:
         assert [(found.severity, found.message) for found in scan_ended(ScanEvidence(source))] == [("info", run.ended)]
         facts = facts_of(source)
         assert facts.frames == "16/19" and run.ended in facts.remarks and source.attributes["ended"] == run.ended
-    assert run.ended.endswith("1 dB less is accepted. 3 planned frames were not taken.")
+    assert run.ended.endswith("a loss of 1 dB is accepted. 3 planned frames were not taken.")
     assert len(ran.of("recon_done")) == 1  # its volume is waited for
 
 

@@ -83,7 +83,7 @@ def test_an_alarm_pauses_a_scan_with_a_closed_shutter_until_it_is_resumed(
     assert ran.result.n_frames == 47
     ((message, was_open),) = paused
     assert "Paused with a closed shutter: 2 consecutive frames have an alarm of the monitor's stuck check" in message
-    assert "`beamline resume` goes on" in message
+    assert "use `beamline resume` to continue" in message
     assert not was_open
     on = [State.TAXI, State.ACQUIRING] if mode == "fly" else [State.ACQUIRING]
     refs = [State.PREPARING, State.DARKS, State.FLATS]

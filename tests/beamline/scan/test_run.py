@@ -68,7 +68,7 @@ def test_the_story_is_told_in_order_and_twice_over(tmp_path: Path) -> None:
     lines = (ran.folder / "events.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["event"] for line in lines] == [event.event for event in ran.events]
     log = (ran.folder / "user.log").read_text(encoding="utf-8")
-    assert "12 projection frames (fly, 0.02 s each)" in log
+    assert "Taking 12 projection frames (fly, exposure 0.02 s)" in log
     assert "Scan complete: 19 frames" in log
 
 
