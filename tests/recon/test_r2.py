@@ -121,7 +121,10 @@ def test_only_ratios_of_weights_count(noisy: np.ndarray, weight: float) -> None:
 
 @pytest.mark.parametrize(
     ("held_out", "message"),
-    [((False,) * 20 + (True,) * 4, "held_out must be .* whole number"), ((7,), r"projections \[7\] are zero everywhere")],
+    [
+        ((False,) * 20 + (True,) * 4, "held_out must be .* whole number"),
+        ((7,), r"projections \[7\] are zero everywhere"),
+    ],
 )
 def test_views_that_cannot_be_held_out_are_refused(noisy: np.ndarray, held_out: tuple[int, ...], message: str) -> None:
     blank = noisy.copy()

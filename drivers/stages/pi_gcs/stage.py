@@ -89,9 +89,7 @@ class PiGcsStage(LineStage):
             self._until_settled(target)
         status = self._axis.status()
         if homing and not status.homed:
-            error = self._stopped_short(
-                "the reference move stopped short", status, "the reference found"
-            )
+            error = self._stopped_short("the reference move stopped short", status, "the reference found")
             self._searching = False
             raise error
         if homing:

@@ -28,8 +28,7 @@ class PulseWidths:
     def __post_init__(self) -> None:
         if self.chosen is not None and not self.allowed:
             raise ValueError(
-                f"the trigger output has no pulses of {self.chosen:g} s; legal: "
-                f"{', '.join(f'{w:g}' for w in MODES)} s"
+                f"the trigger output has no pulses of {self.chosen:g} s; legal: {', '.join(f'{w:g}' for w in MODES)} s"
             )
 
     @property

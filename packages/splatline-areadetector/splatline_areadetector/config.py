@@ -66,7 +66,9 @@ class PandaAngles(_from("panda")):  # type: ignore[misc]
     file: str = setting(doc="The HDF5 file of the PandABox, written in SWMR mode.", min_length=1)
     dataset: str = setting("/INENC1.VAL.Value", "The position captured at each trigger.", min_length=1)
     deg_per_unit: float = setting(1.0, "Degrees for each unit of this dataset.", ge=-1e6, le=1e6)
-    offset_deg: float = setting(0.0, "Degrees that are added to each position.", ge=-1e9, le=1e9)  # of absolute encoders
+    offset_deg: float = setting(
+        0.0, "Degrees that are added to each position.", ge=-1e9, le=1e9
+    )  # of absolute encoders
 
 
 Angles = Annotated[TomoscanAngles | PlanAngles | AttributeAngles | PandaAngles, Field(discriminator="from")]
