@@ -391,8 +391,8 @@ class TomoscanGuide:
 
     def _at(self, history: History, seconds: float) -> list[Any]:
         """The values until a time of the camera's IOC. Its clock may differ from tomoscan's. The clocks count as
-        different only if they differ by more than the delays of frames do. On a busy computer delays differ a lot, and the few
-        values come late, too."""
+        different only if they differ by more than the delays of frames do. On a busy computer delays differ a lot, and
+        the few values come late, too."""
         skew = 0.0 if history.delay is None or math.isinf(self._delay) else self._delay - history.delay
         return [*history.until(seconds + (skew if abs(skew) > SKEW + self._longest - self._delay else 0.0))]
 
