@@ -27,11 +27,11 @@ VIEWS = 2, 5, 12, 30, 45, 60, 90, 90, 120, 180, 360, 720
 EXPLAINED = {
     "wide": r"beyond the field|wider than the field|continues? beyond|no detector column shows air|leaves the field",
     "few": r"limited angle|not a clear optimum|was not found|fewer than|at least|only",
-    "exposed": r"The projections were exposed for|The darks were exposed for",
+    "exposed": r"The projections were exposed for|he darks were exposed for",
     "faint": r"transmit less than the smallest|leaves the field|The projections show no sample|zingers|dead or hot|"
     r"All darks are 0|locally brighter than the flats",
     "cone": r"rotation axis",
-    "always": r"got no beam, or is saturated|dead or hot|zingers",
+    "always": r"got no beam or is saturated|dead or hot|zingers",
 }
 
 Change = Callable[[float, NDArray[np.float64]], NDArray[np.float64]]
