@@ -309,7 +309,7 @@ def test_asd_pocs_takes_a_short_scan_of_a_cone() -> None:
 
 def test_misuse_is_named() -> None:
     projector, truth, views = parallel_case()
-    with pytest.raises(ValueError, match=r"projections .* \(7, 6, 19\).* \(7, 6, 20\)"):
+    with pytest.raises(ValueError, match=r"projections .* \(7, 6, 20\).* \(7, 6, 19\)"):
         solve(Sirt(), projector, views[..., 1:])
     with pytest.raises(ValueError, match="iterations must be"):
         solve(Sirt(0), projector, views)

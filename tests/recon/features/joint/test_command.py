@@ -156,11 +156,11 @@ def test_slices_of_any_time_have_one_window(series: Path) -> None:
         (("--volumes", "1"), 2, "--volumes"),
         (("--moves",), 2, "add --volumes N"),
         (("--volumes", "4", "--no-moves"), 5, "12 views or more for each"),
-        (("--volumes", "2", "--memory", "100K"), 2, "because volumes in time cannot be made in slabs: give --bin"),
+        (("--volumes", "2", "--memory", "100K"), 2, "Use --bin, because volumes in time cannot be made in slabs"),
         (
             ("--volumes", "2", "--memory", "300K"),
             2,
-            "made in slabs: give --rows with 1 row or fewer at a time, or --bin",
+            "Use --rows with 1 row or fewer at a time, or --bin, because volumes in time",
         ),
         (("--volumes", "4", "--dry-run"), 5, "4 volumes of 36 views: expected 12 views or more for each"),
         (("--volumes", "2", "--memory", "100K", "--dry-run"), 2, "because volumes in time cannot be made in slabs"),
@@ -181,7 +181,7 @@ def test_a_dry_run_states_the_memory_and_writes_nothing(
     monkeypatch.chdir(tmp_path)
     done = beamline("recon", str(scan), "--volumes", "2", "--dry-run")
     assert done.exit_code == 0, done.output
-    assert f"{'volumes':<10}2 of 2 x 40 x 40 voxels by series, from 36 views" in done.output
+    assert f"{'volumes':<10}2 of 2 x 40 x 40 voxels with series, from 36 projections" in done.output
     assert "not known: series has to be tried" in done.output.splitlines()[-1]
     told = json.loads(beamline("recon", str(scan), "--volumes", "2", "--dry-run", "--json").stdout)
     assert told["seconds"] is None and told["time"] > 1e9  # of the event
