@@ -20,7 +20,7 @@ from recon.splatting.fit_method import Fit
 from recon.voxels.direct import Fbp, direct
 from recon.voxels.iterative import VoxelMethod, Watch, solve_views
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import pull_methods
+from recon.voxels.ordered_fista import pull_methods
 from recon.voxels.projector import Projector
 
 HALO = 8  # Slices beside a slab, at least, that its error bars need

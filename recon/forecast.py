@@ -25,7 +25,8 @@ from recon.voxels.choice import TRIALS
 from recon.voxels.held_out import CHOICE_SWEEPS, TRIAL_ROWS, TRIAL_SWEEPS, choice_sweeps
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import STEPS, pull_methods
+from recon.voxels.ordered_fista import pull_methods
+from recon.voxels.priors import STEPS
 
 VOXELS = 2**20
 """Of the part that is timed: as many as caches of a processor do not hold several times."""

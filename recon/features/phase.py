@@ -20,7 +20,7 @@ from recon.base.volume import Grid
 from recon.voxels.choice import exceeds_standard_error, preferred_strength
 from recon.voxels.field_edges import busiest_rows, columns_of_matter
 from recon.voxels.held_out import LEAST_VIEWS, predicted_views
-from recon.voxels.methods import FistaTv
+from recon.voxels.methods import EarlyTv
 from recon.voxels.voxel_problem import NORM
 
 _REACH = 4.0  # lengths: beyond, a pixel's influence is below exp(-4)
@@ -32,7 +32,7 @@ depth of a tooth's thin cracks. Simulated cathodes that gain 4 to 11 dB have 14 
 afterwards 13.5 and 13.9 %."""
 _FIRST, _LONGEST = 1.0, 64.0  # squares of lengths, in pixels: where the search begins, and the largest
 _ERRORS = 3.0  # standard errors by which a filter must predict better than none
-_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a trial by `FistaTv`
+_VIEWS, _ONE_IN, _SWEEPS, _TV_WEIGHT = 128, 8, 12, 5e-4  # of a trial by `EarlyTv`
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ def length_by_held_out_views(
     geometry = geometry.select(some).rows(rows.start, rows.stop)
     if matter := columns_of_matter(geometry, Grid.matching(geometry), views):
         views, known, geometry = views[:, :, matter[0]], known[:, matter[0]], matter[1]
-    method, grid = FistaTv(_SWEEPS, _TV_WEIGHT), Grid.matching(geometry)
+    method, grid = EarlyTv(_SWEEPS, _TV_WEIGHT), Grid.matching(geometry)
     weights = None if known.all() else np.broadcast_to(known.astype(np.float32), views.shape)
 
     norms: list[float] = []

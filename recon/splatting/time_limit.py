@@ -21,9 +21,9 @@ from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
 from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
-from recon.voxels.priors import pull_methods, subsets_of
+from recon.voxels.ordered_fista import MANY_SUBSETS, pull_methods, subsets_of
 from recon.voxels.projector import Projector
-from recon.voxels.trial import SUBSETS, TV_STEPS
+from recon.voxels.trial import TV_STEPS
 from recon.voxels.voxel_problem import TotalVariationProx, difference_weights
 
 FINISH_SHARE = 0.8
@@ -48,7 +48,7 @@ def sweep_seconds(geometry: Geometry, grid: Grid, now: Clock) -> float:
     x = projector.adjoint_lines(projector.forward_lines(np.ones((*grid.shape[1:], grid.shape[0]), np.float32)))
     projected = now()
     TotalVariationProx(x.shape, difference_weights(grid), True, TV_STEPS)(x, float(x.max()) / 100)
-    parts = subsets_of(geometry, SUBSETS)
+    parts = subsets_of(geometry, MANY_SUBSETS, damped=False)
     return (projected - begin) * geometry.n_views / some.n_views + (now() - projected) * parts
 
 
@@ -83,7 +83,7 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
     if seconds <= 0:
         return FinishPlan(0, 0.0)
     sweep = sweep_seconds(geometry, grid, now)
-    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, SUBSETS) + _FIRST_SWEEPS) * sweep
+    before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, MANY_SUBSETS, damped=False) + _FIRST_SWEEPS) * sweep
     choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
     most, room = before + FINISH_SWEEPS * sweep, seconds
     if choice:  # else views are too few to hold some out, and patches are not tried

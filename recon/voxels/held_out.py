@@ -13,18 +13,19 @@ from recon.base.method import Method, ReconProblem, RunControl
 from recon.base.view_data import Views, split_views
 from recon.base.volume import Grid
 from recon.voxels.choice import TRIALS
+from recon.voxels.ordered_fista import USUAL_SWEEPS
 from recon.voxels.projector import Projector
 
 TRIAL_SWEEPS = 20
-"""Sweeps of total variation in a trial, and by default of `FistaTv`: a trial that gets less far than its volume prefers
-a heavier weight, one that gets further a lighter one."""
+"""Sweeps of total variation in the trial of a finish, and of `EarlyTv`: a trial that gets less far than its volume
+prefers a heavier weight, one that gets further a lighter one."""
 
 LEAST_VIEWS = 2 * ONE_IN
 
 TRIAL_ROWS = 16
 """Rows of the slab that trials of a prior see."""
 
-CHOICE_SWEEPS = TRIALS * TRIAL_SWEEPS
+CHOICE_SWEEPS = TRIALS * USUAL_SWEEPS
 """Sweeps of trials for a weight, as a rule."""
 
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from recon.base.arrays import F32
 from recon.base.decisions import GoesOn, MaterialPrior, Prior
-from recon.base.empirical import FEWEST_SUBSETS
 from recon.base.method import Plain
 from recon.base.setting import Count
 from recon.base.volume import Volume
@@ -22,9 +21,10 @@ from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import FistaTv
-from recon.voxels.priors import NoiseBalance, Subsets, ordered_fista
+from recon.voxels.ordered_fista import MOST_SWEEPS, USUAL_SWEEPS, Subsets, ordered_fista
+from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import volume_lines
-from recon.voxels.trial import SUBSETS, TV_STEPS, Trial
+from recon.voxels.trial import TV_STEPS, Trial
 from recon.voxels.voxel_problem import Buffers, VoxelProblem
 
 MATERIALS, UNDECIDED, _OF = "materials", "undecided_share", "_of_materials"
@@ -43,7 +43,7 @@ class Discrete(VoxelMethod):
     volume it goes on by total variation alone.
 
     Attributes:
-        iterations: passes over all views after those of FISTA-TV.
+        iterations: passes over all views after those of FISTA-TV, at most.
         levels: densities of the materials in 1/mm, ascending; None: by EM. Where no views can be held out, voxels are
             pulled weakly to levels that are given.
     """
@@ -54,9 +54,9 @@ class Discrete(VoxelMethod):
     halo: ClassVar[int] = FistaTv.halo + 12
     error_bars: ClassVar[tuple[float, float] | None] = 3.0, 0.2
     buffers: ClassVar[Buffers] = Buffers(9.6, 3.0, 4.8, filtered=True)
-    first_sweeps: ClassVar[int] = FistaTv.iterations
+    first_sweeps: ClassVar[int] = MOST_SWEEPS
 
-    iterations: Count = 16
+    iterations: Count = MOST_SWEEPS
     levels: tuple[float, ...] | None = None
     allow_negative: bool = False
 
@@ -68,12 +68,12 @@ class Discrete(VoxelMethod):
     @property
     def trial_sweeps(self) -> int:
         """Sweeps for the weight of total variation, and with materials."""
-        return CHOICE_SWEEPS + _TRIALS * self.iterations
+        return CHOICE_SWEEPS + _TRIALS * min(self.iterations, USUAL_SWEEPS)
 
     @property
     def refused_sweeps(self) -> int:
         """Sweeps of the trials after which few materials are refused and patches may be tried, as a rule."""
-        return len(COUNTS) * self.iterations
+        return len(COUNTS) * min(self.iterations, USUAL_SWEEPS)
 
     @classmethod
     def probabilities(cls, volume: Volume, settings: Mapping[str, Any]) -> F32 | None:
@@ -133,7 +133,7 @@ class Discrete(VoxelMethod):
         where, thin = in_field(problem), thin_parts(x, materials)
         further = replace(problem, go_on=lambda sweep, left: problem.go_on(done + sweep, left))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
-        subsets = Subsets.of(problem, SUBSETS, FEWEST_SUBSETS)
+        subsets = Subsets.of(problem)
         x = ordered_fista(
             further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS,
             pull=MaterialPull(drawn_apart(materials), where, thin),
