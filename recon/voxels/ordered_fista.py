@@ -271,7 +271,7 @@ def ordered_fista(
     """
     descent, scale, count = _Descent(problem, x, subsets, tv_steps, pull), problem.scale, len(subsets.views)
     n_views, by_noise = problem.projector.geometry.n_views, isinstance(weight, NoiseBalance)
-    first = max(_LEAST_ON_SUBSETS, math.ceil(SWEEPS_OF_VIEWS / n_views)) if count > 1 else 0
+    first = 0 if count == 1 else max(_LEAST_ON_SUBSETS, math.ceil(SWEEPS_OF_VIEWS / n_views))
     for k in range(sweeps):
         if k % RENEWED == 0:
             descent.renew_target()

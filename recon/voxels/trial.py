@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions, Prior
-from recon.base.empirical import FIRST_THRESHOLD, ONE_IN, STANDS_STILL
+from recon.base.empirical import FIRST_THRESHOLD, HEAVIER, ONE_IN, STILL_IN_TRIAL
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, ReconProblem, RunControl
 from recon.base.registry import LibraryError
@@ -283,7 +283,8 @@ class Trial:
         best = preferred_strength(self.residuals_of_weight, first)
         if best is None:
             return None
-        of_all = replace(best, strength=best.strength * math.sqrt(ONE_IN / (ONE_IN - 1)))
+        heavier = 1.0 if self.settings.early else HEAVIER
+        of_all = replace(best, strength=best.strength * heavier * math.sqrt(ONE_IN / (ONE_IN - 1)))
         self._known["weight", of_all.strength] = best.residuals
         return of_all
 
@@ -400,7 +401,7 @@ class Trial:
         """
         most = sweeps or (TRIAL_SWEEPS if self.settings.early else MOST_SWEEPS)
         return self.volume_by(lambda part, x: ordered_fista(
-            part, x, weight, self._subsets, sweeps=most, tv_steps=TV_STEPS, pull=pull, still=STANDS_STILL
+            part, x, weight, self._subsets, sweeps=most, tv_steps=TV_STEPS, pull=pull, still=STILL_IN_TRIAL
         ), start)  # fmt: skip
 
     def volume_by(self, make: Callable[[VoxelProblem, F32], F32], start: F32 | None = None) -> F32:
