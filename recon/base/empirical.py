@@ -60,10 +60,6 @@ LEAST_OF_SUBSET = 15
 SWEEPS_OF_VIEWS = 540
 """Views projected in sweeps on subsets before each step is from all views: 18 sweeps of 30 views, 6 of 90."""
 
-HEAVIER = 2 ** (1 / 3)
-"""Times the weight of total variation that predicts views held out best: those of a volume of all views do not know of
-the edges that noise makes. To be measured anew."""
-
 STILL_IN_TRIAL = 0.01
 """The same as `STANDS_STILL`, of trials: all volumes of a trial are compared at the same share. Volumes that begin with
 another one of the trial would stand still too early: a weight of a thousandth of the best one then predicted best."""

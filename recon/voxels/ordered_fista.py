@@ -46,6 +46,9 @@ ENDED = "ended"
 _STILL = "still"  # name of the decision whether the volume stands still
 _LEAST_OF_MANY = 12  # views of a subset without damping
 _LEAST_ON_SUBSETS = 6  # sweeps
+MOST_MOMENTUM = 0.9
+"""Of damped steps. More of it adds up the errors of proximal steps, which take three dual steps: of views whose air
+weighs five times as much as their matter, volumes then change by 1 % in four sweeps for ever."""
 MIRRORED = 4
 """Sweeps after which total variation takes the same differences again, see `TotalVariationProx`: volumes so many sweeps
 apart are compared."""
@@ -168,7 +171,8 @@ class _Descent:
             self._parts = [self._all]
         self._subsets, self._pull, self._problem = subsets, pull, problem
         self.x = device.array(x)
-        self._gradient, self._ahead = device.copy(self.x), Momentum(self.x, problem.decide, device)
+        most = MOST_MOMENTUM if subsets.is_damped else 1.0
+        self._gradient, self._ahead = device.copy(self.x), Momentum(self.x, problem.decide, device, most)
         self._slope: Any = None  # cells of the slope of total variation at the last point
         self._target: Any = None
         self._before: Any = None

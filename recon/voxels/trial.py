@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from recon.base.arrays import F32, F64
 from recon.base.decisions import Decisions, Prior
-from recon.base.empirical import FIRST_THRESHOLD, HEAVIER, ONE_IN, STILL_IN_TRIAL
+from recon.base.empirical import FIRST_THRESHOLD, ONE_IN, STILL_IN_TRIAL
 from recon.base.geometry import Geometry
 from recon.base.method import Clock, Method, ReconProblem, RunControl
 from recon.base.registry import LibraryError
@@ -283,8 +283,7 @@ class Trial:
         best = preferred_strength(self.residuals_of_weight, first)
         if best is None:
             return None
-        heavier = 1.0 if self.settings.early else HEAVIER
-        of_all = replace(best, strength=best.strength * heavier * math.sqrt(ONE_IN / (ONE_IN - 1)))
+        of_all = replace(best, strength=best.strength * math.sqrt(ONE_IN / (ONE_IN - 1)))
         self._known["weight", of_all.strength] = best.residuals
         return of_all
 

@@ -268,10 +268,13 @@ class Momentum:
     """Nesterov's extrapolation between the steps of a descent; it starts anew when it points uphill.
 
     O'Donoghue & Candès 2015, Found. Comput. Math. 15, 715, eq. 13. Memory: two volumes. Arrays are those of a device.
+
+    Args:
+        most: share of the last step that is added, at most.
     """
 
-    def __init__(self, start: Any, decide: Decisions, device: VoxelDevice[Any] = CPU) -> None:
-        self._decide, self._device = decide, device
+    def __init__(self, start: Any, decide: Decisions, device: VoxelDevice[Any] = CPU, most: float = 1.0) -> None:
+        self._decide, self._device, self._most = decide, device, most
         self._last, self._from, self._t = device.copy(start), device.copy(start), 1.0
 
     def __call__(self, x: Any) -> None:
@@ -279,7 +282,7 @@ class Momentum:
         if self._decide("restart", lambda: self._device.turn_of_steps(self._last, self._from, x) > 0):
             self._t = 1.0
         after = (1 + math.sqrt(1 + 4 * self._t**2)) / 2
-        self._device.extrapolate(x, (self._t - 1) / after, self._last, self._from)
+        self._device.extrapolate(x, min((self._t - 1) / after, self._most), self._last, self._from)
         self._t = after
 
 

@@ -102,7 +102,7 @@ class MaterialTrial:
             share /= 2
         lighter, own, heavier = (float(at(each)[0].mean()) for each in (max(share / 2, least_share), share, 2 * share))
         below, above = lighter - own, heavier - own
-        octaves = float(np.clip((below - above) / (2 * (below + above)), -0.5, 0.5)) if below > 0 and above > 0 else 0.0
+        octaves = float(np.clip((below - above) / (2 * (below + above)), -0.5, 0.5)) if below + above > 0 else 0.0
         return *at(share), max(share * _HEAVIER * 2.0**octaves, least_share)
 
     def _better(

@@ -85,8 +85,11 @@ def add_tents(x: F32, factor: float, cells: F32, width: int) -> None:
 
 
 def spectrum_of_tents(cycles: NDArray[np.float64], n: int, width: int) -> NDArray[np.float64]:
-    """What T Tᵀ / width leaves of a wave along one axis, but for aliases: sinc⁴; `cycles`: along n voxels."""
-    return np.asarray(np.sinc(cycles * width / n) ** 4)
+    """What T Tᵀ / width leaves of a wave along one axis, but for aliases; `cycles`: along n voxels, up to half of n.
+
+    A tent is the sum of `width` voxels, twice, so that each of T and Tᵀ takes the square of Dirichlet's kernel.
+    """
+    return np.asarray((np.sinc(cycles * width / n) / np.sinc(cycles / n)) ** 4)
 
 
 def least_width(n: int, most: int) -> int:

@@ -75,12 +75,17 @@ def turn_of_steps(before: Tensor, start: Tensor, end: Tensor) -> float:
     return float(total)
 
 
+def dot(a: Tensor, b: Tensor) -> float:
+    """<a, b> of two arrays of one shape, summed in float64."""
+    total = torch.zeros((), dtype=torch.float64, device=a.device)
+    for some in _parts(a, copies=1):
+        total += (a[some] * b[some]).sum(dtype=torch.float64)
+    return float(total)
+
+
 def norm(x: Tensor) -> float:
-    """The root of the sum of squares, summed in float64."""
-    total = torch.zeros((), dtype=torch.float64, device=x.device)
-    for some in _parts(x, copies=1):
-        total += (x[some] * x[some]).sum(dtype=torch.float64)
-    return math.sqrt(float(total))
+    """The root of <x, x>."""
+    return math.sqrt(dot(x, x))
 
 
 def tent_sums(x: Tensor, width: int) -> Tensor:
@@ -305,7 +310,8 @@ class GpuVolumes:
 
     combine, replace_by_residual = staticmethod(combine), staticmethod(replace_by_residual)
     maximum, add_product = staticmethod(maximum), staticmethod(add_product)
-    turn_of_steps, spread, norm = staticmethod(turn_of_steps), staticmethod(spread), staticmethod(norm)
+    turn_of_steps, spread = staticmethod(turn_of_steps), staticmethod(spread)
+    dot, norm = staticmethod(dot), staticmethod(norm)
     tent_sums, add_tents, filtered = staticmethod(tent_sums), staticmethod(add_tents), staticmethod(filtered)
     extrapolate, pulled_step = staticmethod(extrapolate), staticmethod(pulled_step)
     dual_step, primal, denoise = staticmethod(dual_step), staticmethod(primal), staticmethod(denoise)
