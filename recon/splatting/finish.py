@@ -34,6 +34,9 @@ from recon.voxels.voxel_problem import VoxelProblem
 FINISH_SWEEPS = 8
 """Of total variation after a fit. Without a finish: -1.7 dB on a teapot (docs/published.md)."""
 
+PULLED_SWEEPS = 16
+"""Of a pull to few materials after these."""
+
 _REACH = 1.5  # standard deviations of a Gaussian's longest axis
 
 
@@ -92,11 +95,11 @@ class _Finish:
     def iterate(self, problem: VoxelProblem, x: F32) -> F32:
         trial = cache(partial(Trial.of, problem, TrialSettings(early=True)))
         weight, strength = choose_weight(problem, x, self.iterations, trial), 0.0
-        for method in pull_methods() if self.patches else ():
+        for method in pull_methods(iterations=PULLED_SWEEPS) if self.patches else ():
             if materials := method.materials(problem, weight, trial):
                 self.planned, first = self.iterations + method.iterations, GoesOn(problem.go_on)
                 x = refine(replace(problem, go_on=first), x, weight, strength, self.iterations)
-                return method.pulled(problem, x, weight, materials, self.iterations) if first.going else x
+                return method.pulled(problem, x, weight, materials, self.iterations, False) if first.going else x
         if self.patches:
             patches = choose_patches(problem, weight, trial, PnpDct.iterations)
             strength = patches.strength if patches.better else 0.0

@@ -14,12 +14,13 @@ from recon.base.geometry import Geometry
 from recon.base.method import Clock, Progress, ReconProblem, Reconstruction, RunControl
 from recon.base.method_kinds import Iterative
 from recon.base.volume import Grid
-from recon.splatting.finish import FINISH_SWEEPS, finish
+from recon.splatting.finish import FINISH_SWEEPS, PULLED_SWEEPS, finish
 from recon.splatting.fit_method import Fit
 from recon.splatting.gaussians import Gaussians
 from recon.splatting.splat import voxelize
 from recon.splatting.stream import StreamingFit
-from recon.voxels.held_out import CHOICE_SWEEPS, choice_sweeps
+from recon.voxels.choice import TRIALS
+from recon.voxels.held_out import EARLY_CHOICE_SWEEPS, TRIAL_SWEEPS, choice_sweeps
 from recon.voxels.methods import FistaTv, PnpDct
 from recon.voxels.ordered_fista import MANY_SUBSETS, pull_methods, subsets_of
 from recon.voxels.projector import Projector
@@ -84,12 +85,12 @@ def finish_within(seconds: float, beside_steps: float, geometry: Geometry, grid:
         return FinishPlan(0, 0.0)
     sweep = sweep_seconds(geometry, grid, now)
     before = (_EIGENVALUE_ROUNDS / subsets_of(geometry, MANY_SUBSETS, damped=False) + _FIRST_SWEEPS) * sweep
-    choice, patches = choice_sweeps(geometry) * sweep, PnpDct()
+    choice, patches = choice_sweeps(geometry, early=True) * sweep, PnpDct()
     most, room = before + FINISH_SWEEPS * sweep, seconds
     if choice:  # else views are too few to hold some out, and patches are not tried
-        most += patches.iterations * sweep + choice * (
-            patches.trial_sweeps + sum(method.refused_sweeps for method in pull_methods())
-        ) / CHOICE_SWEEPS  # fmt: skip
+        trials_of_patches = EARLY_CHOICE_SWEEPS + TRIAL_SWEEPS + TRIALS * patches.trial_steps
+        refused = sum(each.refused_sweeps for each in pull_methods(iterations=PULLED_SWEEPS))
+        most += patches.iterations * sweep + choice * (trials_of_patches + refused) / EARLY_CHOICE_SWEEPS
         room = min(seconds, beside_steps)
     if most <= room:
         return FinishPlan(None, most)

@@ -64,7 +64,10 @@ class Damping:
         down = np.fft.fftfreq(rows) * rows
         across = np.fft.rfftfreq(cols) * cols
         given = ((down, rows), (across, cols))
-        kept = [np.maximum(spectrum_of_tents(f, n * self.width, self.width), _LEAST_OF_TENTS) for f, n in given]
+        kept = [
+            np.maximum(spectrum_of_tents(f.astype(np.float64), n * self.width, self.width), _LEAST_OF_TENTS)
+            for f, n in given
+        ]
         side = max(rows, cols)
         cycles = np.hypot(down[:, None] * side / rows, across[None] * side / cols)
         left = 1 - np.clip(cycles / _UNDAMPED, 1, self.gain) / self.gain

@@ -9,10 +9,11 @@ from functools import cache, partial
 from typing import ClassVar, Self
 
 from recon.base.arrays import F32
+from recon.base.choices import Quality
 from recon.base.decisions import GoesOn, Prior
 from recon.base.empirical import STANDS_STILL
 from recon.base.geometry import Geometry
-from recon.base.method import Plain, Quality
+from recon.base.method import Plain
 from recon.base.setting import Count, Natural, NonNegative
 from recon.base.volume import Grid
 from recon.kernels.cpu.patches import scratch_values

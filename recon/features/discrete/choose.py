@@ -88,7 +88,8 @@ class MaterialTrial:
         """Residuals and materials of the share of total variation that predicts best in octaves, and the share chosen.
 
         Octaves are tried from 1 down to `least_share` while half the share predicts better by `LEAST_GAIN`. The vertex
-        of the parabola through the best and its neighbours is taken, and `_HEAVIER` times it is chosen.
+        of the parabola through the best and its neighbours is taken, and `_HEAVIER` times it is chosen. Of a sample
+        wider than the field the octave itself is.
         """
         count, tried = len(chosen.levels), {chosen.tv_share: (best, chosen)}
 
@@ -103,7 +104,7 @@ class MaterialTrial:
         lighter, own, heavier = (float(at(each)[0].mean()) for each in (max(share / 2, least_share), share, 2 * share))
         below, above = lighter - own, heavier - own
         octaves = float(np.clip((below - above) / (2 * (below + above)), -0.5, 0.5)) if below + above > 0 else 0.0
-        return *at(share), max(share * _HEAVIER * 2.0**octaves, least_share)
+        return *at(share), max(share if self._trial.wide else share * _HEAVIER * 2.0**octaves, least_share)
 
     def _better(
         self, best: F64, chosen: MaterialPrior, count: int, tv_share: float, pull: float = PULLS[0]

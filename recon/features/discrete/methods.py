@@ -21,7 +21,7 @@ from recon.voxels.choice import Prediction, TrialChoice
 from recon.voxels.held_out import CHOICE_SWEEPS
 from recon.voxels.iterative import VoxelMethod
 from recon.voxels.methods import FistaTv
-from recon.voxels.ordered_fista import MOST_SWEEPS, USUAL_SWEEPS, Subsets, ordered_fista
+from recon.voxels.ordered_fista import MANY_SUBSETS, MOST_SWEEPS, SUBSETS, USUAL_SWEEPS, Subsets, ordered_fista
 from recon.voxels.priors import NoiseBalance
 from recon.voxels.projector import volume_lines
 from recon.voxels.trial import TV_STEPS, Trial
@@ -127,13 +127,15 @@ class Discrete(VoxelMethod):
         return materials if materials.levels else None
 
     def pulled(
-        self, problem: VoxelProblem, x: F32, weight: NoiseBalance | float, materials: MaterialPrior, done: int
-    ) -> F32:
-        """The volume x [y, x, z] after `iterations` passes with a pull to the materials, `done` passes before."""
+        self, problem: VoxelProblem, x: F32, weight: NoiseBalance | float, materials: MaterialPrior, done: int,
+        damped: bool = True,
+    ) -> F32:  # fmt: skip
+        """The volume x [y, x, z] after `iterations` passes with a pull to the materials, `done` passes before; `damped`
+        as of `Subsets.of`."""
         where, thin = in_field(problem), thin_parts(x, materials)
         further = replace(problem, go_on=lambda sweep, left: problem.go_on(done + sweep, left))
         mu = weight.value if isinstance(weight, NoiseBalance) else weight
-        subsets = Subsets.of(problem)
+        subsets = Subsets.of(problem, SUBSETS if damped else MANY_SUBSETS, damped)
         x = ordered_fista(
             further, x, mu * materials.tv_share, subsets, sweeps=self.iterations, tv_steps=TV_STEPS,
             pull=MaterialPull(drawn_apart(materials), where, thin),
